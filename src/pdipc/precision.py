@@ -1,0 +1,61 @@
+"""The floating-point type that a scene computes in, and how kernels are made for it.
+
+Every kernel file holds factories, `functions(real)` and `kernels(real)`, that build its Warp functions and kernels once for
+each precision. So there is one source for float32 and float64, the constants in it have the right type, and a formula can be
+called from Python: `functions(real("float64")).barrier(d, d_hat)`.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+@dataclass(frozen=True)
+class Real:
+    """A floating-point type with the vector and matrix types made of it.
+
+    name: "float32" or "float64". unit_roundoff: half the spacing of numbers just above one.
+    """
+
+    name: str
+    scalar: Any
+    vec2: Any
+    vec3: Any
+    vec4: Any
+    mat22: Any
+    mat33: Any
+    quat: Any
+    numpy: Any
+    unit_roundoff: float
+
+    def module(self, name: str) -> wp.Module:
+        """The Warp module for the kernels of the Python module `name` in this precision.
+
+        One module for each precision, so that using the second does not recompile the first; no adjoints are compiled.
+        """
+        module = wp.get_module(f"{name}.{self.name}")
+        module.options["enable_backward"] = False
+        return module
+
+
+@functools.cache
+def real(name: str) -> Real:
+    """The precision called "float32" or "float64". Raises ValueError for any other name."""
+    if name not in ("float32", "float64"):
+        raise ValueError(f'precision is "{name}"; it must be "float32" or "float64"')
+    scalar = getattr(wp, name)
+    return Real(
+        name=name,
+        scalar=scalar,
+        vec2=wp.types.vector(2, scalar),
+        vec3=wp.types.vector(3, scalar),
+        vec4=wp.types.vector(4, scalar),
+        mat22=wp.types.matrix((2, 2), scalar),
+        mat33=wp.types.matrix((3, 3), scalar),
+        quat=wp.types.quaternion(scalar),
+        numpy=np.dtype(name),
+        unit_roundoff=float(np.finfo(name).eps) / 2.0,
+    )
