@@ -1,0 +1,10 @@
+"""The global step: solving K x = b for all vertices, K = A (x) I3 + contact Hessian (Section 5).
+
+The matrix A is constant, the same for the three coordinates, and known before the simulation; contacts only ever add to K.
+`System` holds A on the device, `make_solver` builds any of the solvers by name.
+"""
+
+from pdipc.linear.solvers import SOLVERS, Contact, Solver, make_solver
+from pdipc.linear.system import System
+
+__all__ = ["SOLVERS", "Contact", "Solver", "System", "make_solver"]

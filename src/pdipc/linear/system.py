@@ -1,0 +1,67 @@
+"""The constant matrix A of Eq. (3) on the device."""
+
+import functools
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from pdipc.linear import spectrum
+from pdipc.parallel import Device
+from pdipc.precision import Real
+
+
+class System:
+    """A = M/h^2 + sum of w G^T G: symmetric, positive definite on the free vertices, one scalar for each pair of vertices.
+
+    device, real: where and in which precision the solvers compute.
+    matrix: (n, n) scipy sparse matrix, kg/s^2. Rows may be empty (vertices of obstacles).
+    free: (n,) bool; False for vertices whose position is prescribed: solvers read it and leave it as it is.
+
+    On the device: the off-diagonal entries of the free rows as compressed rows, the diagonal apart from them.
+    diagonal: (n,) A_ii where free, 0 elsewhere, kg/s^2.
+    Raises ValueError where the matrix is not square, not symmetric, or a free vertex has a diagonal entry that is not positive.
+    """
+
+    def __init__(self, device: Device, real: Real, matrix: sp.spmatrix, free: np.ndarray):
+        matrix = sp.csr_matrix(matrix, dtype=np.float64)
+        matrix.sum_duplicates()
+        free = np.asarray(free, dtype=bool)
+        _check(matrix, free)
+        self.device, self.real, self.matrix, self.free = device, real, matrix, free
+        self.count = matrix.shape[0]
+        rows = sp.diags_array(free.astype(np.float64)) @ (matrix - sp.diags_array(matrix.diagonal()))
+        rows = sp.csr_matrix(rows)
+        rows.eliminate_zeros()
+        rows.sort_indices()
+        self.entries = rows.nnz
+        self.offsets = wp.array(rows.indptr.astype(np.int32), device=device.warp)
+        self.columns = wp.array(_at_least_one(rows.indices.astype(np.int32)), device=device.warp)
+        self.values = wp.array(_at_least_one(rows.data.astype(real.numpy)), device=device.warp)
+        self.diagonal = wp.array(np.where(free, matrix.diagonal(), 0.0).astype(real.numpy), device=device.warp)
+
+    @functools.cached_property
+    def interval(self) -> tuple[float, float]:
+        """[lo, hi], which holds all eigenvalues of D^-1 A on the free vertices (with a margin)."""
+        return spectrum.interval(self.matrix, self.free)
+
+
+def _at_least_one(values: np.ndarray) -> np.ndarray:
+    return values if values.size else np.zeros(1, dtype=values.dtype)
+
+
+def _check(matrix: sp.csr_matrix, free: np.ndarray) -> None:
+    n, columns = matrix.shape
+    if n != columns or free.shape != (n,):
+        raise ValueError(f"the matrix is {n} x {columns} and free has shape {free.shape}; needed: (n, n) and (n,)")
+    asymmetry = abs(matrix - matrix.T)
+    largest = abs(matrix).max() if matrix.nnz else 0.0
+    if asymmetry.nnz and not asymmetry.max() <= 1e-12 * largest:
+        i, j = np.unravel_index(asymmetry.argmax(), asymmetry.shape)
+        raise ValueError(
+            f"the matrix is not symmetric: entries ({i}, {j}) and ({j}, {i}) are {matrix[i, j]} and {matrix[j, i]}"
+        )
+    diagonal = matrix.diagonal()
+    bad = np.flatnonzero(free & ~(diagonal > 0.0))
+    if bad.size:
+        raise ValueError(f"free vertex {bad[0]} has the diagonal entry {diagonal[bad[0]]}; it must be positive (has it mass?)")
