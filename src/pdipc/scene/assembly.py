@@ -1,0 +1,324 @@
+"""A scene as arrays: one numbering of all vertices, simulated and kinematic, and what is known about them."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pdipc.scene import meshes
+from pdipc.scene.errors import SceneError
+from pdipc.scene.meshes import Mesh
+from pdipc.scene.motion import Trajectory, rotation_matrix
+from pdipc.scene.schema import (
+    Arrays,
+    Body,
+    Cloth,
+    ClothMaterial,
+    Obstacle,
+    Placed,
+    Scene,
+    Selection,
+    Solid,
+    SolidMaterial,
+    Wind,
+)
+
+ACTIVATION_PART = 1e-3  # default activation distance, of the scene size
+SEPARATION_PART = 0.02  # default minimum separation, of the activation distance
+
+
+@dataclass
+class AssembledBody:
+    """One body or obstacle; its vertices are first, ..., last - 1 of the whole.
+
+    tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward.
+    material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
+    trajectory: how an obstacle moves; None for bodies.
+    """
+
+    name: str
+    kind: Literal["solid", "cloth", "obstacle"]
+    first: int
+    last: int
+    tets: np.ndarray
+    triangles: np.ndarray
+    material: SolidMaterial | ClothMaterial | None
+    half_separation: float
+    friction: float
+    trajectory: Trajectory | None = None
+
+    @property
+    def kinematic(self) -> bool:
+        """Whether all its vertices follow a script."""
+        return self.kind == "obstacle"
+
+
+@dataclass
+class AssembledPin:
+    """Held vertices (k,) int32. trajectory: how their points move. stiffness: N/m a vertex, or None: held exactly."""
+
+    body: str
+    vertices: np.ndarray
+    trajectory: Trajectory
+    stiffness: float | None
+
+
+@dataclass
+class AssembledAttachment:
+    """Springs between vertices_a (k,) and vertices_b (k,) int32 of stiffness N/m and rest_lengths (k,) m."""
+
+    vertices_a: np.ndarray
+    vertices_b: np.ndarray
+    stiffness: float
+    rest_lengths: np.ndarray
+
+
+@dataclass
+class AssembledWind:
+    """Wind on triangles (m, 3) int32, from start to end, s (end may be inf); see `schema.Wind` for its force."""
+
+    triangles: np.ndarray
+    velocity: np.ndarray
+    air_density: float
+    drag: float
+    start: float
+    end: float
+
+
+@dataclass
+class AssembledForce:
+    """The force (3,) N on each of vertices (k,) int32, from start to end, s (end may be inf)."""
+
+    vertices: np.ndarray
+    force: np.ndarray
+    start: float
+    end: float
+
+
+@dataclass
+class Assembly:
+    """A scene as arrays of float64 and int32, in SI units. Bodies come first, obstacles after them.
+
+    positions: (n, 3) at the start, m. rest_positions: (n, 3) at rest, placed where the body starts, m.
+    velocities: (n, 3) at the start, m/s; zero for what is kinematic. body_of_vertex: (n,) int32, index into `bodies`.
+    scene_size: L, the diagonal of the bounding box of all deformable bodies at the start, m.
+    activation_distance: d_hat, m; 1e-3 L unless the scene says otherwise.
+    minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
+    """
+
+    positions: np.ndarray
+    rest_positions: np.ndarray
+    velocities: np.ndarray
+    bodies: list[AssembledBody]
+    body_of_vertex: np.ndarray
+    scene_size: float
+    activation_distance: float
+    minimum_separation: float
+    pins: list[AssembledPin] = field(default_factory=list)
+    attachments: list[AssembledAttachment] = field(default_factory=list)
+    winds: list[AssembledWind] = field(default_factory=list)
+    forces: list[AssembledForce] = field(default_factory=list)
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """(m, 3) int32: the surfaces of all bodies and obstacles."""
+        return np.concatenate([body.triangles for body in self.bodies])
+
+    @property
+    def tets(self) -> np.ndarray:
+        """(t, 4) int32: those of all solids."""
+        return np.concatenate([body.tets for body in self.bodies])
+
+    @property
+    def kinematic_vertices(self) -> np.ndarray:
+        """(k,) int32, ascending: vertices of obstacles and those that pins hold exactly."""
+        mask = np.zeros(len(self.positions), dtype=bool)
+        for vertices, _ in self._scripted():
+            mask[vertices] = True
+        return np.flatnonzero(mask).astype(np.int32)
+
+    def kinematic_positions(self, time: float) -> np.ndarray:
+        """(k, 3) m: where `kinematic_vertices` are at `time` s."""
+        positions = self.positions.copy()
+        for vertices, trajectory in self._scripted():
+            positions[vertices] = trajectory.apply(self.positions[vertices], time)
+        return positions[self.kinematic_vertices]
+
+    def pin_targets(self, pin: AssembledPin, time: float) -> np.ndarray:
+        """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
+        return pin.trajectory.apply(self.positions[pin.vertices], time)
+
+    def _scripted(self) -> list[tuple[np.ndarray, Trajectory]]:
+        obstacles = [(np.arange(b.first, b.last), b.trajectory) for b in self.bodies if b.trajectory is not None]
+        return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
+
+
+def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
+    """The mesh of a body or obstacle in its own coordinates, and its vertices at the start (n, 3), not yet placed.
+
+    Raises SceneError where it cannot be read or is of the wrong kind.
+    """
+    where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
+    source, start = placed.mesh, None
+    try:
+        if isinstance(source, str):
+            mesh = meshes.read(source)
+        elif isinstance(source, Arrays):
+            mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
+            start = source.start
+        else:
+            mesh = source.mesh()
+    except SceneError as error:
+        raise SceneError(f"{where}: {error}") from error
+    if not isinstance(placed, Solid):
+        if len(mesh.tets):
+            mesh, start = mesh.surface(), None if start is None else start[np.unique(mesh.triangles)]
+    elif not len(mesh.tets):
+        if not placed.tetrahedralize:
+            raise SceneError(
+                f"{where}: a solid needs tetrahedra, its mesh has triangles only; give a tetrahedral mesh or set tetrahedralize = true"
+            )
+        mesh = meshes.tetrahedralize(mesh, where)
+    return mesh, mesh.vertices if start is None else start
+
+
+def assemble(scene: Scene) -> Assembly:
+    """Reads the meshes of `scene`, places them, and numbers everything.
+
+    Raises SceneError where a mesh cannot be read, or a name or index is unknown. What is wrong with the geometry is for
+    `pdipc.scene.check` to find.
+    """
+    parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
+    first = 0
+    for placed in (*scene.bodies, *scene.obstacles):
+        mesh, start = load_mesh(placed)
+        matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
+        rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
+        for name, offset in _copies(placed):
+            body = AssembledBody(
+                name,
+                placed.kind if isinstance(placed, Solid | Cloth) else "obstacle",
+                first,
+                first + len(rest),
+                mesh.tets + first,
+                mesh.triangles + first,
+                placed.material if isinstance(placed, Solid | Cloth) else None,
+                half_separation=0.0,
+                friction=scene.contact.friction if placed.friction is None else placed.friction,
+            )
+            velocities = np.zeros_like(rest)
+            if isinstance(placed, Body):
+                center = meshes.center_of_mass(Mesh(start, mesh.triangles, mesh.tets))
+                velocities = np.array(placed.velocity) + np.cross(placed.angular_velocity, start - center)
+            parts.append((body, placed, Mesh(rest + offset, mesh.triangles, mesh.tets), start + offset, velocities))
+            first = body.last
+
+    bodies = [part[0] for part in parts]
+    positions = np.concatenate([part[3] for part in parts])
+    deformable = positions[: max((body.last for body in bodies if not body.kinematic), default=0)]
+    scene_size = float(np.linalg.norm(np.ptp(deformable, axis=0)))
+    activation_distance = scene.contact.activation_distance or ACTIVATION_PART * scene_size
+    minimum_separation = scene.contact.minimum_separation or SEPARATION_PART * activation_distance
+    assembly = Assembly(
+        positions,
+        np.concatenate([part[2].vertices for part in parts]),
+        np.concatenate([part[4] for part in parts]),
+        bodies,
+        np.repeat(np.arange(len(bodies), dtype=np.int32), [body.last - body.first for body in bodies]),
+        scene_size,
+        activation_distance,
+        minimum_separation,
+    )
+    for body, placed, _, start, _ in parts:
+        body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
+        if isinstance(placed, Obstacle):
+            body.trajectory = Trajectory(placed.motion, _middle(start))
+        else:
+            for number, pin in enumerate(placed.pins):
+                vertices = _select(assembly, body, pin.select, f"pins[{number}]")
+                trajectory = Trajectory(pin.motion, _middle(positions[vertices]))
+                assembly.pins.append(AssembledPin(body.name, vertices, trajectory, pin.stiffness))
+    assembly.velocities[assembly.kinematic_vertices] = 0.0
+    _attach(assembly, scene)
+    _force(assembly, scene)
+    return assembly
+
+
+def _copies(placed: Placed) -> list[tuple[str, np.ndarray]]:
+    copies = placed.copies if isinstance(placed, Body) else None
+    if copies is None:
+        return [(placed.name, np.zeros(3))]
+    z, y, x = np.indices(copies.counts[::-1]).reshape(3, -1)
+    return [(f"{placed.name}[{i}]", offset) for i, offset in enumerate(np.column_stack([x, y, z]) * copies.spacing)]
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    return 0.5 * (points.min(axis=0) + points.max(axis=0)) if len(points) else np.zeros(3)
+
+
+def _body(assembly: Assembly, name: str, where: str) -> AssembledBody:
+    for body in assembly.bodies:
+        if body.name == name:
+            return body
+    raise SceneError(f'{where}: there is no body "{name}"; there are: {", ".join(body.name for body in assembly.bodies)}')
+
+
+def _select(assembly: Assembly, body: AssembledBody, select: Selection, where: str) -> np.ndarray:
+    """(k,) int32, ascending; may be empty: the check reports that."""
+    points = assembly.positions[body.first : body.last]
+    if select.vertices is not None:
+        _in_range(body, select.vertices, where)
+        chosen = np.unique(np.array(select.vertices, dtype=np.int32))
+    elif select.box is not None:
+        chosen = np.flatnonzero(np.all((points >= select.box[0]) & (points <= select.box[1]), axis=1))
+    elif select.sphere is not None:
+        chosen = np.flatnonzero(np.linalg.norm(points - select.sphere[0], axis=1) <= select.sphere[1])
+    elif select.nearest is not None:
+        chosen = np.array([np.argmin(np.linalg.norm(points - select.nearest, axis=1))])
+    else:
+        chosen = np.arange(len(points))
+    return (chosen + body.first).astype(np.int32)
+
+
+def _in_range(body: AssembledBody, vertices: list[int], where: str) -> None:
+    count = body.last - body.first
+    beyond = [vertex for vertex in vertices if not 0 <= vertex < count]
+    if beyond:
+        raise SceneError(
+            f'body "{body.name}", {where}: vertex {beyond[0]} is out of range; it has the vertices 0 to {count - 1}'
+        )
+
+
+def _attach(assembly: Assembly, scene: Scene) -> None:
+    for number, table in enumerate(scene.attachments):
+        where = f"attachments[{number}]"
+        a, b = (_body(assembly, name, where) for name in table.bodies)
+        if table.pairs is not None:
+            pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
+            _in_range(a, table.pairs and [pair[0] for pair in table.pairs], where)
+            _in_range(b, table.pairs and [pair[1] for pair in table.pairs], where)
+        else:
+            near = cKDTree(assembly.positions[b.first : b.last])
+            distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
+            chosen = np.flatnonzero(np.isfinite(distance))
+            pairs = np.column_stack([chosen, nearest[chosen]])
+        vertices_a, vertices_b = (pairs[:, 0] + a.first).astype(np.int32), (pairs[:, 1] + b.first).astype(np.int32)
+        lengths = np.linalg.norm(assembly.positions[vertices_a] - assembly.positions[vertices_b], axis=1)
+        if table.rest_length is not None:
+            lengths = np.full(len(pairs), table.rest_length)
+        assembly.attachments.append(AssembledAttachment(vertices_a, vertices_b, table.stiffness, lengths))
+
+
+def _force(assembly: Assembly, scene: Scene) -> None:
+    for number, table in enumerate(scene.forces):
+        where, end = f"forces[{number}]", np.inf if table.end is None else table.end
+        if isinstance(table, Wind):
+            names = [body.name for body in assembly.bodies if not body.kinematic] if table.bodies is None else table.bodies
+            triangles = np.concatenate([_body(assembly, name, where).triangles for name in names])
+            wind = AssembledWind(triangles, np.array(table.velocity), table.air_density, table.drag, table.start, end)
+            assembly.winds.append(wind)
+        else:
+            vertices = _select(assembly, _body(assembly, table.body, where), table.select, where)
+            share = np.array(table.force) / max(1, len(vertices))
+            assembly.forces.append(AssembledForce(vertices, share, table.start, end))

@@ -1,0 +1,448 @@
+"""What a scene file may say: the pydantic models behind the TOML keys and the Python arguments of the same names.
+
+Units are SI (m, kg, s, N, Pa); orientations are in degrees, rates of rotation in rad/s; y points up. Unknown keys are refused.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
+
+from pdipc.scene import generators
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = tuple[Number, Number, Number]
+
+
+class Table(BaseModel):
+    """What all tables share: unknown keys are refused, also on assignment from Python."""
+
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, arbitrary_types_allowed=True)
+
+
+def _exactly_one(table: BaseModel, *names: str) -> None:
+    given = [name for name in names if getattr(table, name) not in (None, False)]
+    if len(given) != 1:
+        raise ValueError(f"exactly one of {', '.join(names)} is needed; given: {', '.join(given) or 'none'}")
+
+
+# --- simulation and contact ---
+
+
+class Simulation(Table):
+    """How time advances."""
+
+    time_step: Positive = Field(0.01, le=1.0, description="Length h of a step, s.")
+    steps: int = Field(200, ge=0, description="Number of steps of a run.")
+    substeps: int = Field(1, ge=1, le=1000, description="Solves in a step, each of h / substeps.")
+    gravity: Vector = Field((0.0, -9.81, 0.0), description="Acceleration of every body, m/s^2.")
+    damping: NotNegative = Field(
+        0.0, le=1e4, description="Mass-proportional damping, 1/s: a free body loses this part of its velocity per second."
+    )
+    precision: Literal["auto", "float32", "float64"] = Field(
+        "auto", description='Working precision; "auto" takes what measured faster on the device.'
+    )
+    device: str | None = Field(None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
+    outer_tolerance: Positive = Field(
+        1e-5,
+        le=1.0,
+        description="A step has converged when an outer iteration moves no vertex further than this part of the scene size.",
+    )
+    max_outer: int = Field(
+        50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
+    )
+    inner_iterations: int = Field(5, ge=1, description="Local-global iterations in an outer iteration.")
+    linear_solver: str = Field("pcg", description="Solver of the global step; see `pdipc.linear.solvers`.")
+    linear_iterations: int = Field(10, ge=1, description="Most iterations of a global solve.")
+    linear_tolerance: Positive = Field(
+        1e-4, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
+    )
+    solver_order: int = Field(2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
+    budget_ms: Positive | None = Field(
+        None,
+        description="Time after which a step takes no further outer iteration, ms; absent: none. Results then depend on the machine.",
+    )
+
+
+class Contact(Table):
+    """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
+
+    method: Literal["barrier", "paper"] = Field(
+        "barrier",
+        description='"barrier" is force-consistent and converges to the IPC solution; "paper" is Eq. (6) of the paper as printed.',
+    )
+    activation_distance: Positive | None = Field(
+        None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
+    )
+    minimum_separation: Positive | None = Field(
+        None,
+        description="Gap that no pair of surfaces ever closes (xi), m; absent: 0.02 of the activation distance. A body may set its own.",
+    )
+    stiffness_scale: Positive = Field(
+        3.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
+    )
+    friction: NotNegative = Field(0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
+    friction_velocity: Positive = Field(1e-3, description="Sliding slower than this counts as sticking, m/s.")
+    restitution: float = Field(0.0, ge=0, le=1, description="Part of the approach speed that an impact gives back.")
+    broad_phase: Literal["auto", "bvh", "patches"] = Field("auto", description="How candidate pairs are found.")
+    truncation: Literal["per_vertex", "global"] = Field(
+        "per_vertex",
+        description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens.',
+    )
+
+
+# --- meshes and where they stand ---
+
+
+def _array(dtype: type, width: int) -> Any:
+    def read(value: Any) -> Any:
+        array = np.array(value, dtype=None if dtype is np.int32 else dtype)
+        if array.size and dtype is np.int32 and array.dtype.kind not in "iu":
+            raise ValueError("must be whole numbers")
+        if array.size and (array.ndim != 2 or array.shape[1] != width):
+            raise ValueError(f"has the shape {array.shape}; must be (n, {width})")
+        return array.reshape(-1, width).astype(dtype)
+
+    return Annotated[np.ndarray, BeforeValidator(read), PlainSerializer(lambda array: array.tolist(), return_type=list)]
+
+
+class Arrays(Table):
+    """A mesh given by its numbers: tets for a solid, triangles for cloth and obstacles."""
+
+    vertices: _array(np.float64, 3) = Field(description="V (n, 3): rest positions, m.")
+    tets: _array(np.int32, 4) | None = Field(None, description="T (t, 4): indices into vertices.")
+    triangles: _array(np.int32, 3) | None = Field(
+        None, description="F (m, 3): indices into vertices; a solid's follow from its tets."
+    )
+    start: _array(np.float64, 3) | None = Field(
+        None, description="(n, 3): positions at the start where these differ from rest, m."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> "Arrays":
+        if self.tets is None and self.triangles is None:
+            raise ValueError("tets or triangles are needed")
+        if self.start is not None and self.start.shape != self.vertices.shape:
+            raise ValueError(f"start has the shape {self.start.shape}; it must be that of vertices, {self.vertices.shape}")
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Arrays) and all(np.array_equal(a, getattr(other, name)) for name, a in self if a is not None)
+
+
+def _resolve(path: str, info: ValidationInfo) -> str:
+    """A path in a scene file is relative to the file."""
+    folder = (info.context or {}).get("folder")
+    return path if folder is None or path.startswith("warp:") else str((Path(folder) / path).resolve())
+
+
+def _mesh_kind(value: Any) -> str | None:
+    if isinstance(value, (str, Path)):
+        return "file"
+    if isinstance(value, Arrays) or (isinstance(value, dict) and "vertices" in value):
+        return "arrays"
+    shape = value.get("shape") if isinstance(value, dict) else getattr(value, "shape", None)
+    return shape if isinstance(shape, str) else None
+
+
+SHAPE_NAMES = tuple(shape.model_fields["shape"].default for shape in generators.SHAPES)
+_File = Annotated[str, BeforeValidator(str), AfterValidator(_resolve)]
+MeshSource = Annotated[
+    Annotated[_File, Tag("file")]
+    | Annotated[Arrays, Tag("arrays")]
+    | Annotated[generators.Box, Tag("box")]
+    | Annotated[generators.Sphere, Tag("sphere")]
+    | Annotated[generators.Cylinder, Tag("cylinder")]
+    | Annotated[generators.Capsule, Tag("capsule")]
+    | Annotated[generators.Torus, Tag("torus")]
+    | Annotated[generators.Bowl, Tag("bowl")]
+    | Annotated[generators.Stairs, Tag("stairs")]
+    | Annotated[generators.Grid, Tag("grid")]
+    | Annotated[generators.Plane, Tag("plane")],
+    Discriminator(
+        _mesh_kind,
+        custom_error_type="mesh",
+        custom_error_message="must be a file path, a table with shape = "
+        + ", ".join(f'"{name}"' for name in SHAPE_NAMES)
+        + ", or a table with vertices and tets or triangles",
+    ),
+]
+
+
+class Placed(Table):
+    """A mesh, and where it stands: x = translation + R (scale * vertex)."""
+
+    name: str = Field(min_length=1, description="Name, unique in the scene.")
+    mesh: MeshSource = Field(
+        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp), a shape, or arrays."
+    )
+    scale: Positive | tuple[Positive, Positive, Positive] = Field(
+        1.0, description="Factor on the mesh's coordinates; along x, y, z if three."
+    )
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0), description="Turns about the fixed axes x, then y, then z, degrees; about the mesh's origin."
+    )
+    translation: Vector = Field((0.0, 0.0, 0.0), description="Where the mesh's origin goes, m.")
+    friction: NotNegative | None = Field(
+        None, le=10.0, description="Friction coefficient; absent: that of `contact`. A pair takes the geometric mean."
+    )
+    minimum_separation: Positive | None = Field(
+        None,
+        description="Gap kept to a body of the same kind, such as the thickness of cloth, m; two bodies keep the mean of theirs. "
+        "Absent: that of `contact`.",
+    )
+
+
+# --- materials ---
+
+
+class SolidMaterial(Table):
+    """Isotropic and elastic."""
+
+    density: Positive = Field(1000.0, le=1e5, description="Mass per volume, kg/m^3.")
+    young_modulus: Positive = Field(1e5, le=1e12, description="Young's modulus, Pa.")
+    poisson_ratio: float = Field(0.4, ge=0, le=0.499, description="Poisson's ratio.")
+
+
+class ClothMaterial(Table):
+    """A thin sheet: stretched by its membrane stiffness, bent by its bending stiffness."""
+
+    areal_density: Positive = Field(0.2, le=1e4, description="Mass per area, kg/m^2.")
+    thickness: Positive = Field(
+        1e-3, le=1.0, description="Thickness, m: turns young_modulus into the two stiffnesses; contact ignores it."
+    )
+    young_modulus: Positive | None = Field(None, le=1e12, description="Young's modulus, Pa; absent: 1e5.")
+    membrane_stiffness: Positive | None = Field(
+        None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
+    )
+    poisson_ratio: float = Field(0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
+    bending_stiffness: NotNegative | None = Field(
+        None, le=1e6, description="Flexural rigidity, N m; absent: membrane_stiffness thickness^2 / (12 (1 - poisson_ratio^2))."
+    )
+    bending: Literal["quadratic", "curved"] = Field(
+        "quadratic", description='"quadratic" for cloth that is flat at rest, "curved" keeps a curved rest shape.'
+    )
+    membrane: Literal["strain", "springs"] = Field(
+        "strain", description='"springs" replaces the triangles\' elasticity by one spring an edge.'
+    )
+
+    @model_validator(mode="after")
+    def _fill(self) -> "ClothMaterial":
+        """Completes the stiffnesses, so that readers find numbers; what was given stays known in `model_fields_set`."""
+        given = self.__dict__
+        if self.membrane_stiffness is None or "membrane_stiffness" not in self.model_fields_set:
+            given["membrane_stiffness"] = (self.young_modulus or 1e5) * self.thickness
+        elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, self.membrane_stiffness, rtol=1e-6):
+            raise ValueError(
+                f"membrane_stiffness = {self.membrane_stiffness} N/m contradicts young_modulus * thickness = "
+                f"{self.young_modulus * self.thickness} N/m; give one of the two"
+            )
+        if self.bending_stiffness is None or "bending_stiffness" not in self.model_fields_set:
+            given["bending_stiffness"] = self.membrane_stiffness * self.thickness**2 / (12 * (1 - self.poisson_ratio**2))
+        return self
+
+
+# --- motions, pins, attachments ---
+
+
+class Keyframe(Table):
+    """Where something is at one time, relative to its start."""
+
+    time: NotNegative = Field(description="Time, s.")
+    translation: Vector = Field((0.0, 0.0, 0.0), description="Displacement from the start, m.")
+    rotation: Vector = Field(
+        (0.0, 0.0, 0.0), description="Turns about the fixed axes x, then y, then z through `center`, degrees, from the start."
+    )
+
+
+class Motion(Table):
+    """A scripted rigid motion: keyframes, or a constant velocity and spin in a time window."""
+
+    keyframes: list[Keyframe] = Field(
+        [],
+        description="Poses in order of time; held before the first and after the last. Between two, the shorter turn is taken.",
+    )
+    smooth: bool = Field(False, description="Ease in and out between keyframes, without jumps of velocity.")
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="Velocity of `center`, m/s.")
+    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="Spin: direction is the axis, length the rate, rad/s.")
+    center: Vector | None = Field(
+        None, description="Point at the start that rotations turn about, m; absent: the middle of the bounding box."
+    )
+    start: NotNegative = Field(0.0, description="When velocity and spin begin, s.")
+    end: Positive | None = Field(None, description="When they end, s; absent: never.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Motion":
+        if self.keyframes and (any(self.velocity) or any(self.angular_velocity)):
+            raise ValueError("keyframes exclude velocity and angular_velocity")
+        times = [keyframe.time for keyframe in self.keyframes]
+        if any(b <= a for a, b in itertools.pairwise(times)):
+            raise ValueError(f"keyframes must be in order of time; their times are {times}")
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"end = {self.end} s must be later than start = {self.start} s")
+        return self
+
+
+class Selection(Table):
+    """Vertices of a body, chosen in one way; places are those at the start, in the scene's coordinates."""
+
+    vertices: list[Annotated[int, Field(ge=0)]] | None = Field(None, description="Indices into the body's vertices.")
+    box: tuple[Vector, Vector] | None = Field(None, description="Lower and upper corner, m.")
+    sphere: tuple[Vector, Positive] | None = Field(None, description="Centre and radius, m.")
+    nearest: Vector | None = Field(None, description="The one vertex nearest to this point, m.")
+    all: bool = Field(False, description="Every vertex.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Selection":
+        _exactly_one(self, "vertices", "box", "sphere", "nearest", "all")
+        if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):
+            raise ValueError(f"box: the lower corner {self.box[0]} is above the upper corner {self.box[1]}")
+        return self
+
+
+class Pin(Table):
+    """Vertices held where they start, or led along a motion."""
+
+    select: Selection = Field(description="Which vertices.")
+    motion: Motion | None = Field(None, description="How the points that hold them move; absent: not at all.")
+    stiffness: Positive | None = Field(
+        None, description="Of the spring from each vertex to its point, N/m; absent: held exactly."
+    )
+
+
+class Attachment(Table):
+    """Springs between vertices of two bodies."""
+
+    bodies: tuple[str, str] = Field(description="Names of the two bodies; an obstacle may be one; both may be the same.")
+    pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] | None = Field(
+        None, description="Vertex of the first and of the second body, pair by pair."
+    )
+    within: Positive | None = Field(
+        None,
+        description="Attach each vertex of the first body to the nearest one of the second that is no further than this, m.",
+    )
+    stiffness: Positive = Field(1000.0, description="Of each spring, N/m.")
+    rest_length: NotNegative | None = Field(
+        None, description="Length at which springs are at rest, m; absent: the one at the start."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> "Attachment":
+        _exactly_one(self, "pairs", "within")
+        return self
+
+
+# --- bodies and obstacles ---
+
+
+class Copies(Table):
+    """A body repeated in a grid; the copies are called `name[0]`, `name[1]`, ... with x running fastest, then y, then z."""
+
+    counts: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = Field(
+        (1, 1, 1), description="Copies along x, y, z."
+    )
+    spacing: Vector = Field((1.0, 1.0, 1.0), description="From one copy to the next along x, y, z, m.")
+
+
+class Body(Placed):
+    """What solids and cloth share."""
+
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="At the start, m/s.")
+    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="At the start, about the centre of mass, rad/s.")
+    pins: list[Pin] = Field([], description="Vertices that are held.")
+    copies: Copies | None = Field(None, description="Repeats the body in a grid.")
+
+
+class Solid(Body):
+    """A soft body of tetrahedra."""
+
+    kind: Literal["solid"] = "solid"
+    material: SolidMaterial = Field(default_factory=SolidMaterial, description="What it is made of.")
+    tetrahedralize: bool = Field(
+        False, description='Fill a closed triangle mesh with tets on loading; needs the extra "tetrahedralize".'
+    )
+
+
+class Cloth(Body):
+    """A thin sheet of triangles."""
+
+    kind: Literal["cloth"] = "cloth"
+    material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
+
+
+class Obstacle(Placed):
+    """A rigid surface, open or closed, that moves as told and feels nothing."""
+
+    motion: Motion | None = Field(None, description="How it moves; absent: not at all.")
+
+
+# --- forces ---
+
+
+class _Window(Table):
+    start: NotNegative = Field(0.0, description="When it begins, s.")
+    end: Positive | None = Field(None, description="When it ends, s; absent: never.")
+
+    @model_validator(mode="after")
+    def _check_window(self) -> "_Window":
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"end = {self.end} s must be later than start = {self.start} s")
+        return self
+
+
+class Wind(_Window):
+    """Pressure of moving air on surfaces: each triangle feels drag air_density / 2 |u.n| (u.n) area n, u the air's velocity past it."""
+
+    kind: Literal["wind"] = "wind"
+    velocity: Vector = Field(description="Velocity of the air, m/s.")
+    air_density: Positive = Field(1.2, description="kg/m^3.")
+    drag: NotNegative = Field(1.0, description="Drag coefficient.")
+    bodies: list[str] | None = Field(None, description="Names of the bodies that feel it; absent: all.")
+
+
+class VertexForce(_Window):
+    """A force on chosen vertices of a body, shared evenly among them."""
+
+    kind: Literal["vertices"] = "vertices"
+    body: str = Field(description="Name of the body.")
+    select: Selection = Field(description="Which vertices.")
+    force: Vector = Field(description="Total over the chosen vertices, N.")
+
+
+# --- the scene ---
+
+
+class Scene(Table):
+    """Everything that a simulation starts from."""
+
+    title: str = Field("", description="One line.")
+    description: str = Field("", description="What it shows.")
+    simulation: Simulation = Field(default_factory=Simulation, description="How time advances.")
+    contact: Contact = Field(default_factory=Contact, description="How surfaces keep apart.")
+    bodies: list[Annotated[Solid | Cloth, Field(discriminator="kind")]] = Field(min_length=1, description="What is simulated.")
+    obstacles: list[Obstacle] = Field([], description="Rigid surfaces, static or scripted.")
+    attachments: list[Attachment] = Field([], description="Springs between bodies.")
+    forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field([], description="Beyond gravity.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Scene":
+        names = [placed.name for placed in (*self.bodies, *self.obstacles)]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"names must be unique; used more than once: {', '.join(twice)}")
+        return self
