@@ -4,7 +4,8 @@ The matrix A is constant, the same for the three coordinates, and known before t
 `System` holds A on the device, `make_solver` builds any of the solvers by name.
 """
 
-from pdipc.linear.solvers import SOLVERS, Contact, Solver, make_solver
+from pdipc.linear.solver import Contact, Solver
+from pdipc.linear.solvers import SOLVERS, make_solver
 from pdipc.linear.system import System
 
 __all__ = ["SOLVERS", "Contact", "Solver", "System", "make_solver"]

@@ -13,12 +13,11 @@ import numpy as np
 import warp as wp
 
 from pdipc.linear import kernels as shared
-from pdipc.linear.kernels import BLOCK
-from pdipc.linear.solvers import Contact, Solver
+from pdipc.linear.solver import Contact, Solver
 from pdipc.linear.system import System
 from pdipc.precision import Real
 
-CHECK = 4  # sweeps between two looks at the residual; even, so that the result ends up in x
+CHECK = 4  # sweeps between two looks at the residual; even, so that the result is where the start was
 
 
 def chebyshev_factors(rho: float, count: int) -> np.ndarray:
@@ -33,6 +32,7 @@ class Jacobi(Solver):
     """Weighted Jacobi iteration.
 
     weight: w; by default 2/(lo + hi) from the spectral interval. Plain Jacobi, w = 1, diverges where hi >= 2.
+    The residual is looked at every CHECK sweeps, and is the one before the last sweep.
     """
 
     accelerated = False
@@ -40,48 +40,43 @@ class Jacobi(Solver):
     def __init__(self, system: System, tolerance: float, max_iterations: int, weight: float | None = None):
         super().__init__(system, tolerance, max_iterations)
         lo, hi = system.interval
-        hi = max(hi, 1.0)
+        hi = max(hi, 1.0)  # contacts may move eigenvalues up to 1
         self.weight = 2.0 / (lo + hi) if weight is None else weight
         self.rho = max(abs(1.0 - self.weight * lo), abs(1.0 - self.weight * hi))
         sweeps = -(-max_iterations // CHECK) * CHECK
         factors = chebyshev_factors(self.rho, sweeps) if self.accelerated else np.ones(sweeps)
         self._factors = wp.array(factors.astype(self.real.numpy), device=self.device.warp)
-        vec3, scalar = self.real.vec3, self.real.scalar
-        self._other, self._w = self.zeros(vec3), self.zeros(vec3)
-        self._partial, self._partial_first = self.zeros(scalar, self.blocks), self.zeros(scalar, self.blocks)
-        self._first = self.zeros(scalar, 1)
-        self._done, self._condition = self.zeros(wp.int32, 1), self.zeros(wp.int32, 1)
+        self._x, self._before, self._w = (self.zeros(self.real.vec3) for _ in range(3))
         self._kernels = kernels(self.real)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None) -> None:
+    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
         apply = contact.apply if contact is not None else None
-        k, system = self._kernels, self.system
-        matrix = [system.offsets, system.columns, system.values, self.total, self.inverse, self.inverse_block]
+        k, sums = self._kernels, self.sums
+        matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
+        weights = [self.real.scalar(self.weight), self._factors, self.left, self.max_iterations]
         self.invert_diagonal(contact)
-        self.device.copy(self._other, x)
+        self.copy(self._x, x)
+        self.copy(self._before, x)
         if apply:
             self.clear(self._w)
-        self.device.launch_serial(k.begin, [self._done, self._condition])
+
+        def sweep(source: wp.array, target: wp.array, step: int) -> None:
+            if apply:
+                apply(source, self._w)
+            sums.launch(k.sweep, [*matrix, *weights, step, int(apply is not None), self._w, source, target, self.partial])
+
+        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        sweep(self._x, self._before, -1)
+        sums.conclude(k.begin, [self.partial, sums.slots, reference, *self.limits, *status])
 
         def iterate() -> None:
-            source, target = x, self._other
-            for step in range(CHECK):
-                if apply:
-                    apply(source, self._w)
-                self.device.launch(
-                    k.sweep,
-                    self.blocks,
-                    [*matrix, b, self.real.scalar(self.weight), self._factors, self._done, step, system.count]
-                    + [int(apply is not None), self._w, source, target, self._partial if step else self._partial_first],
-                    grain=BLOCK,
-                )
-                source, target = target, source
-            status = [self.real.scalar(self.tolerance), self.max_iterations, self._first, self._done, self.iterations]
-            self.device.launch_serial(
-                k.check, [self._partial_first, self._partial, self.blocks, *status, self.residual, self._condition]
-            )
+            for step in range(0, CHECK, 2):
+                sweep(self._x, self._before, step)
+                sweep(self._before, self._x, step + 1)
+            sums.conclude(k.check, [self.partial, sums.slots, *self.limits, *status])
 
-        self.device.loop(self._condition, iterate)
+        self.device.loop(self.condition, iterate)
+        self.copy(x, self._x)
 
 
 class Chebyshev(Jacobi):
@@ -96,17 +91,13 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
     f = shared.functions(real)
-    block = wp.constant(BLOCK)
     check_every = wp.constant(CHECK)
-
-    @wp.kernel(module=module)
-    def begin(first: int, done_out: wp.array(dtype=wp.int32), condition_out: wp.array(dtype=wp.int32)):
-        done_out[0] = 0
-        condition_out[0] = 1
 
     @wp.kernel(module=module)
     def sweep(
         first: int,
+        share: int,
+        count: int,
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
@@ -116,55 +107,70 @@ def kernels(real: Real) -> SimpleNamespace:
         b: wp.array(dtype=vec3),
         weight: scalar,
         factors: wp.array(dtype=scalar),
-        done: wp.array(dtype=wp.int32),
+        left: wp.array(dtype=wp.int32),
+        max_iterations: int,
         step: int,
-        count: int,
         coupled: int,
         w: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
     ):
-        """One sweep from x; `before` holds the iterate before x on entry and the one after it on return."""
+        """One sweep from x: `before` holds the iterate before x, and on return the one after it. Step -1: only the residual."""
         worker = first + wp.tid()
-        zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        omega = factors[done[0] + step]
-        total = scalar(0.0)
-        for i in range(worker * block, wp.min((worker + 1) * block, count)):
+        omega = scalar(0.0)
+        if step >= 0:
+            omega = factors[max_iterations - left[0] + step]
+        gamma = scalar(0.0)
+        for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if inverse[i] != scalar(0.0):
-                r = b[i] - diagonal[i] * x[i] - f.row_product(i, offsets, columns, values, x)
+                own = x[i]
+                r = b[i] - diagonal[i] * own - f.row_product(i, offsets, columns, values, x)
                 if coupled != 0:
                     r -= w[i]
                 u = f.precondition(i, inverse, inverse_block, r)
-                total += wp.dot(r, u)
-                before[i] = before[i] + omega * (x[i] + weight * u - before[i])
+                gamma += wp.dot(r, u)
+                last = before[i]
+                before[i] = last + omega * (own + weight * u - last)
             if coupled != 0:
-                w[i] = zero
-        partial_out[worker] = total
+                w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        f.store_sum(gamma, worker, partial_out)
 
     @wp.kernel(module=module)
-    def check(
+    def begin(
         first: int,
-        partial_first: wp.array(dtype=scalar),
         partial: wp.array(dtype=scalar),
-        workers: int,
+        slots: int,
+        reference: wp.array(dtype=scalar),
         tolerance: scalar,
         max_iterations: int,
-        first_gamma: wp.array(dtype=scalar),
-        done: wp.array(dtype=wp.int32),
+        first_out: wp.array(dtype=scalar),
+        left_out: wp.array(dtype=wp.int32),
         iterations: wp.array(dtype=wp.int32),
         residual_out: wp.array(dtype=scalar),
         condition_out: wp.array(dtype=wp.int32),
     ):
-        gamma = f.sum_partials(partial, workers)
-        if done[0] == 0:
-            first_gamma[0] = f.sum_partials(partial_first, workers)
-        residual = scalar(0.0)
-        if first_gamma[0] > scalar(0.0):
-            residual = wp.sqrt(gamma / first_gamma[0])
-        residual_out[0] = residual
-        done[0] = done[0] + check_every
-        iterations[0] = iterations[0] + check_every
-        condition_out[0] = wp.where(residual > tolerance and done[0] < max_iterations, 1, 0)
+        lane = first + wp.tid()
+        gamma = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            f.begin_status(gamma, reference, tolerance, max_iterations, first_out, left_out, residual_out, condition_out)
+
+    @wp.kernel(module=module)
+    def check(
+        first: int,
+        partial: wp.array(dtype=scalar),
+        slots: int,
+        tolerance: scalar,
+        max_iterations: int,
+        first_norm: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
+        iterations: wp.array(dtype=wp.int32),
+        residual_out: wp.array(dtype=scalar),
+        condition_out: wp.array(dtype=wp.int32),
+    ):
+        lane = first + wp.tid()
+        gamma = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            f.update_status(gamma, check_every, tolerance, first_norm, left, iterations, residual_out, condition_out)
 
     return SimpleNamespace(**locals())

@@ -1,37 +1,68 @@
-"""Kernels shared by the solvers: the matrix product, the preconditioner, sums.
+"""What the solvers' kernels share: preconditioner, sums, copies.
 
-A worker handles BLOCK consecutive vertices, and its share of a sum goes to one slot: sums do not depend on how many threads
-there are.
+A kernel that also adds something up starts with
+
+    worker = first + wp.tid()
+    for i in range(worker * share, wp.min((worker + 1) * share, count)):
+
+and ends with `store_sum`. On the CPU a worker has a share of BLOCK vertices and one slot of `partial`; on CUDA each thread
+has one vertex and each block of BLOCK threads one slot. So sums do not depend on the number of threads.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
+from pdipc.linear import rows
+from pdipc.parallel import Device
 from pdipc.precision import Real
 
-BLOCK = 256  # vertices that one worker handles
+BLOCK = 256  # vertices whose numbers are added up together
+
+# Four sums side by side, because an addition has to wait for the one before.
+_SUM_SLOTS = """
+    SCALAR a = 0, b = 0, c = 0, d = 0;
+    int k = lane;
+    for (; k + 3 * step < count; k += 4 * step) {
+        a += partial.data[k]; b += partial.data[k + step]; c += partial.data[k + 2 * step]; d += partial.data[k + 3 * step];
+    }
+    for (; k < count; k += step) { a += partial.data[k]; }
+    return (a + b) + (c + d);
+"""
+
+
+class Sums:
+    """Launches kernels that add up over the vertices, and the single-block kernels that use the sums.
+
+    slots: number of partial sums.
+    """
+
+    def __init__(self, device: Device, count: int):
+        self.device, self.count = device, count
+        self.slots = max(1, -(-count // BLOCK))
+
+    def launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Runs `kernel(first, share, count, *inputs)` over all vertices."""
+        if self.device.is_cuda:
+            wp.launch(kernel, self.slots * BLOCK, [0, 1, self.count, *inputs], device=self.device.warp, block_dim=BLOCK)
+        else:
+            self.device.launch(kernel, self.slots, [BLOCK, self.count, *inputs], grain=BLOCK)
+
+    def conclude(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Runs `kernel(first, *inputs)` in one thread on the CPU and in one block of threads on CUDA."""
+        if self.device.is_cuda:
+            wp.launch(kernel, BLOCK, [0, *inputs], device=self.device.warp, block_dim=BLOCK)
+        else:
+            self.device.launch_serial(kernel, inputs)
 
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    """Warp functions on one vertex."""
+    """Warp functions on one vertex, and the two halves of a sum."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-
-    @wp.func
-    def row_product(
-        i: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
-    ):
-        """Off-diagonal part of (A x)_i."""
-        total = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        for e in range(offsets[i], offsets[i + 1]):
-            total += values[e] * x[columns[e]]
-        return total
+    row_product = rows.functions(real).row_product
 
     @wp.func
     def precondition(i: int, inverse: wp.array(dtype=scalar), inverse_block: wp.array(dtype=mat33), r: vec3):
@@ -42,31 +73,78 @@ def functions(real: Real) -> SimpleNamespace:
         return factor * r
 
     @wp.func
-    def sum_partials(partial: wp.array(dtype=scalar), count: int):
-        """Sum of `count` numbers, in four interleaved parts because an addition has to wait for the one before."""
-        a, b, c, d = scalar(0.0), scalar(0.0), scalar(0.0), scalar(0.0)
-        quarter = count // 4
-        for k in range(quarter):
-            a += partial[4 * k]
-            b += partial[4 * k + 1]
-            c += partial[4 * k + 2]
-            d += partial[4 * k + 3]
-        for k in range(4 * quarter, count):
-            a += partial[k]
-        return (a + b) + (c + d)
+    def store_sum(total: scalar, worker: int, partial_out: wp.array(dtype=scalar)):
+        """Adds `total` up over the block of threads and stores it in the block's slot."""
+        wp.tile_store(partial_out, wp.tile_sum(wp.tile(total)), offset=worker // wp.block_dim())
+
+    @wp.func_native(_SUM_SLOTS.replace("SCALAR", f"wp::{real.name}"))
+    def sum_slots(partial: wp.array(dtype=scalar), count: int, lane: int, step: int) -> scalar: ...
+
+    @wp.func
+    def sum_partials(partial: wp.array(dtype=scalar), count: int, lane: int):
+        """Sum of `count` numbers, by one thread or one block of threads; every thread gets it."""
+        total = wp.tile_sum(wp.tile(sum_slots(partial, count, lane, wp.block_dim())))
+        return wp.tile_extract(total, 0)
+
+    @wp.func
+    def begin_status(
+        gamma: scalar,
+        reference: wp.array(dtype=scalar),
+        tolerance: scalar,
+        max_iterations: int,
+        first_out: wp.array(dtype=scalar),
+        left_out: wp.array(dtype=wp.int32),
+        residual_out: wp.array(dtype=scalar),
+        condition_out: wp.array(dtype=wp.int32),
+    ):
+        """What a solve notes before its first iteration, gamma = r . D^-1 r."""
+        norm = wp.sqrt(gamma)
+        if reference:
+            first_out[0] = reference[0]
+        else:
+            first_out[0] = norm
+        left_out[0] = max_iterations
+        residual = scalar(0.0)
+        if first_out[0] > scalar(0.0):
+            residual = norm / first_out[0]
+        residual_out[0] = residual
+        condition_out[0] = wp.where(residual > tolerance, 1, 0)
+
+    @wp.func
+    def update_status(
+        gamma: scalar,
+        done: int,
+        tolerance: scalar,
+        first_norm: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
+        iterations: wp.array(dtype=wp.int32),
+        residual_out: wp.array(dtype=scalar),
+        condition_out: wp.array(dtype=wp.int32),
+    ):
+        """What a solve notes after `done` more iterations."""
+        residual = wp.sqrt(gamma) / first_norm[0]
+        residual_out[0] = residual
+        iterations[0] = iterations[0] + done
+        left[0] = left[0] - done
+        condition_out[0] = wp.where(residual > tolerance and left[0] > 0, 1, 0)
 
     return SimpleNamespace(**locals())
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    """The preconditioner's kernels."""
+    """Kernels on single vertices."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
 
     @wp.kernel(module=module)
     def clear(first: int, values_out: wp.array(dtype=vec3)):
         values_out[first + wp.tid()] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+
+    @wp.kernel(module=module)
+    def copy(first: int, values: wp.array(dtype=vec3), values_out: wp.array(dtype=vec3)):
+        i = first + wp.tid()
+        values_out[i] = values[i]
 
     @wp.kernel(module=module)
     def invert_diagonal(
@@ -78,14 +156,13 @@ def kernels(real: Real) -> SimpleNamespace:
         inverse_out: wp.array(dtype=scalar),
         inverse_block_out: wp.array(dtype=mat33),
     ):
-        """total = A_ii + scalar contact part, inverse = its inverse, or -1 and the inverse of the 3x3 block. 0 where not free."""
+        """total = A_ii + contact scalar; inverse = 1/total, or -1 with the inverse of the 3x3 block; 0 where not free."""
         i = first + wp.tid()
-        d = diagonal[i]
-        total = d
+        total = diagonal[i]
         inverse = scalar(0.0)
-        if d > scalar(0.0):
+        if total > scalar(0.0):
             if contact_scalar:
-                total = d + contact_scalar[i]
+                total += contact_scalar[i]
             inverse = scalar(1.0) / total
             if contact_block:
                 block = contact_block[i]

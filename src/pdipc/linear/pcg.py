@@ -15,13 +15,30 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.linear import kernels as shared
-from pdipc.linear.kernels import BLOCK
-from pdipc.linear.solvers import Contact, Solver
+from pdipc.linear.solver import Contact, Solver
 from pdipc.linear.system import System
 from pdipc.precision import Real
 
-# Slots of the array of numbers that one solve carries along.
-ALPHA, BETA, GAMMA, GAMMA_FIRST = (wp.constant(k) for k in range(4))
+# Slots of the array of numbers that a solve carries along.
+ALPHA, BETA, GAMMA = (wp.constant(k) for k in range(3))
+
+# A loop over all components at once, which compilers turn into wide instructions.
+_ADVANCE = """
+    const SCALAR* wv = (const SCALAR*)w.data;
+    const SCALAR* uv = (const SCALAR*)u.data;
+    SCALAR* __restrict pv = (SCALAR*)p.data;
+    SCALAR* __restrict sv = (SCALAR*)s.data;
+    SCALAR* __restrict xv = (SCALAR*)x.data;
+    SCALAR* __restrict rv = (SCALAR*)r.data;
+    for (int k = 3 * low; k < 3 * high; ++k) {
+        const SCALAR direction = uv[k] + beta * pv[k];
+        const SCALAR image = wv[k] + beta * sv[k];
+        pv[k] = direction;
+        sv[k] = image;
+        xv[k] += alpha * direction;
+        rv[k] -= alpha * image;
+    }
+"""
 
 
 class Pcg(Solver):
@@ -31,52 +48,37 @@ class Pcg(Solver):
         super().__init__(system, tolerance, max_iterations)
         vec3, scalar = self.real.vec3, self.real.scalar
         self._r, self._u, self._w, self._p, self._s = (self.zeros(vec3) for _ in range(5))
-        self._partial = self.zeros(scalar, self.blocks)
-        self._numbers = self.zeros(scalar, 4)
-        self._condition = self.zeros(wp.int32, 1)
-        self._left = self.zeros(wp.int32, 1)
+        self._numbers = self.zeros(scalar, 3)
         self._kernels = kernels(self.real)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None) -> None:
+    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
         apply = contact.apply if contact is not None else None
-        k, system, launch = self._kernels, self.system, self.device.launch
-        matrix = [system.offsets, system.columns, system.values, self.total]
+        coupled = int(apply is not None)
+        k, sums = self._kernels, self.sums
+        matrix = [*self.system.rows.arguments, self.total]
         preconditioner = [self.inverse, self.inverse_block]
         self.invert_diagonal(contact)
         if apply:
             self.clear(self._w)
             apply(x, self._w)
-        launch(
-            k.start,
-            self.blocks,
-            [*matrix, *preconditioner, b, x, system.count, int(apply is not None), self._w, self._r, self._u, self._p, self._s]
-            + [self._partial],
-            grain=BLOCK,
+        self.copy(self._p, x)
+        sums.launch(
+            k.start, [*matrix, *preconditioner, b, self._p, coupled, self._w, self._s, self._r, self._u, self.partial]
         )
-        numbers = [self._partial, self.blocks, self._numbers]
-        status = [self.real.scalar(self.tolerance), self.iterations, self.residual, self._left, self._condition]
-        self.device.launch_serial(k.begin, [*numbers, self.max_iterations, *status])
+        self.clear(self._p)
+        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        sums.conclude(k.begin, [self.partial, sums.slots, self._numbers, reference, *self.limits, *status])
 
         def iterate() -> None:
             if apply:
                 apply(self._u, self._w)
-            launch(
-                k.multiply,
-                self.blocks,
-                [*matrix, self._u, system.count, int(apply is not None), self._w, self._partial],
-                grain=BLOCK,
-            )
-            self.device.launch_serial(k.find_alpha, numbers)
-            launch(
-                k.update,
-                self.blocks,
-                [*preconditioner, self._numbers, system.count, int(apply is not None), self._w, self._p, self._s, x, self._r]
-                + [self._u, self._partial],
-                grain=BLOCK,
-            )
-            self.device.launch_serial(k.find_beta, [*numbers, *status])
+            sums.launch(k.multiply, [*matrix, self._u, coupled, self._w, self.partial])
+            sums.conclude(k.find_alpha, [self.partial, sums.slots, self._numbers, self.left])
+            vectors = [self._w, self._p, self._s, x, self._r, self._u]
+            sums.launch(k.update, [*preconditioner, self._numbers, coupled, *vectors, self.partial])
+            sums.conclude(k.find_beta, [self.partial, sums.slots, self._numbers, *self.limits, *status])
 
-        self.device.loop(self._condition, iterate)
+        self.device.loop(self.condition, iterate)
 
 
 @functools.cache
@@ -85,11 +87,26 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
     f = shared.functions(real)
-    block = wp.constant(BLOCK)
+
+    @wp.func_native(_ADVANCE.replace("SCALAR", f"wp::{real.name}"))
+    def advance(
+        low: int,
+        high: int,
+        alpha: scalar,
+        beta: scalar,
+        w: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+        s: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+    ): ...
 
     @wp.kernel(module=module)
     def start(
         first: int,
+        share: int,
+        count: int,
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
@@ -98,20 +115,18 @@ def kernels(real: Real) -> SimpleNamespace:
         inverse_block: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        count: int,
         coupled: int,
         w: wp.array(dtype=vec3),
+        s_out: wp.array(dtype=vec3),
         r_out: wp.array(dtype=vec3),
         u_out: wp.array(dtype=vec3),
-        p_out: wp.array(dtype=vec3),
-        s_out: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
     ):
         """r = b - K x, u = D^-1 r, gamma = r . u; w holds the contacts' part of K x and is left zero."""
         worker = first + wp.tid()
         zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         gamma = scalar(0.0)
-        for i in range(worker * block, wp.min((worker + 1) * block, count)):
+        for i in range(worker * share, wp.min((worker + 1) * share, count)):
             r = zero
             u = zero
             if inverse[i] != scalar(0.0):
@@ -122,21 +137,21 @@ def kernels(real: Real) -> SimpleNamespace:
                 gamma += wp.dot(r, u)
             r_out[i] = r
             u_out[i] = u
-            p_out[i] = zero
             s_out[i] = zero
             if coupled != 0:
                 w[i] = zero
-        partial_out[worker] = gamma
+        f.store_sum(gamma, worker, partial_out)
 
     @wp.kernel(module=module)
     def multiply(
         first: int,
+        share: int,
+        count: int,
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
         diagonal: wp.array(dtype=scalar),
         u: wp.array(dtype=vec3),
-        count: int,
         coupled: int,
         w: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
@@ -144,21 +159,23 @@ def kernels(real: Real) -> SimpleNamespace:
         """w = K u, where w holds the contacts' part already, and delta = u . w."""
         worker = first + wp.tid()
         delta = scalar(0.0)
-        for i in range(worker * block, wp.min((worker + 1) * block, count)):
-            product = diagonal[i] * u[i] + f.row_product(i, offsets, columns, values, u)
+        for i in range(worker * share, wp.min((worker + 1) * share, count)):
+            own = u[i]
+            product = diagonal[i] * own + f.row_product(i, offsets, columns, values, u)
             if coupled != 0:
                 product += w[i]
             w[i] = product
-            delta += wp.dot(u[i], product)
-        partial_out[worker] = delta
+            delta += wp.dot(own, product)
+        f.store_sum(delta, worker, partial_out)
 
     @wp.kernel(module=module)
     def update(
         first: int,
+        share: int,
+        count: int,
         inverse: wp.array(dtype=scalar),
         inverse_block: wp.array(dtype=mat33),
         numbers: wp.array(dtype=scalar),
-        count: int,
         coupled: int,
         w: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -170,73 +187,81 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """All vectors one step on, and gamma = r . u; w is left zero where contacts will add to it."""
         worker = first + wp.tid()
-        alpha = numbers[ALPHA]
-        beta = numbers[BETA]
-        zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        low = worker * share
+        high = wp.min(low + share, count)
+        advance(low, high, numbers[ALPHA], numbers[BETA], w, u, p, s, x, r)
         gamma = scalar(0.0)
-        for i in range(worker * block, wp.min((worker + 1) * block, count)):
-            direction = u[i] + beta * p[i]
-            image = w[i] + beta * s[i]
-            residual = r[i] - alpha * image
-            p[i] = direction
-            s[i] = image
-            x[i] = x[i] + alpha * direction
-            r[i] = residual
+        for i in range(low, high):
+            residual = r[i]
             corrected = f.precondition(i, inverse, inverse_block, residual)
             u[i] = corrected
             gamma += wp.dot(residual, corrected)
             if coupled != 0:
-                w[i] = zero
-        partial_out[worker] = gamma
+                w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        f.store_sum(gamma, worker, partial_out)
 
     @wp.kernel(module=module)
     def begin(
         first: int,
         partial: wp.array(dtype=scalar),
-        workers: int,
+        slots: int,
         numbers: wp.array(dtype=scalar),
-        max_iterations: int,
+        reference: wp.array(dtype=scalar),
         tolerance: scalar,
+        max_iterations: int,
+        first_out: wp.array(dtype=scalar),
+        left_out: wp.array(dtype=wp.int32),
         iterations: wp.array(dtype=wp.int32),
         residual_out: wp.array(dtype=scalar),
-        left_out: wp.array(dtype=wp.int32),
         condition_out: wp.array(dtype=wp.int32),
     ):
-        gamma = f.sum_partials(partial, workers)
-        numbers[ALPHA] = scalar(1.0)
-        numbers[BETA] = scalar(0.0)
-        numbers[GAMMA] = gamma
-        numbers[GAMMA_FIRST] = gamma
-        left_out[0] = max_iterations
-        going = gamma > scalar(0.0) and tolerance < scalar(1.0)
-        residual_out[0] = wp.where(gamma > scalar(0.0), scalar(1.0), scalar(0.0))
-        condition_out[0] = wp.where(going, 1, 0)
+        lane = first + wp.tid()
+        gamma = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            numbers[ALPHA] = scalar(1.0)
+            numbers[BETA] = scalar(0.0)
+            numbers[GAMMA] = gamma
+            f.begin_status(gamma, reference, tolerance, max_iterations, first_out, left_out, residual_out, condition_out)
 
     @wp.kernel(module=module)
-    def find_alpha(first: int, partial: wp.array(dtype=scalar), workers: int, numbers: wp.array(dtype=scalar)):
-        delta = f.sum_partials(partial, workers)
-        gamma = numbers[GAMMA]
-        numbers[ALPHA] = gamma / (delta - numbers[BETA] * gamma / numbers[ALPHA])
+    def find_alpha(
+        first: int,
+        partial: wp.array(dtype=scalar),
+        slots: int,
+        numbers: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
+    ):
+        """alpha; where rounding has made K look indefinite, no step and the end."""
+        lane = first + wp.tid()
+        delta = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            gamma = numbers[GAMMA]
+            curvature = delta - numbers[BETA] * gamma / numbers[ALPHA]
+            if curvature > scalar(0.0):
+                numbers[ALPHA] = gamma / curvature
+            else:
+                numbers[ALPHA] = scalar(0.0)
+                left[0] = 0
 
     @wp.kernel(module=module)
     def find_beta(
         first: int,
         partial: wp.array(dtype=scalar),
-        workers: int,
+        slots: int,
         numbers: wp.array(dtype=scalar),
         tolerance: scalar,
+        max_iterations: int,
+        first_norm: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
         iterations: wp.array(dtype=wp.int32),
         residual_out: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
         condition_out: wp.array(dtype=wp.int32),
     ):
-        gamma = f.sum_partials(partial, workers)
-        numbers[BETA] = gamma / numbers[GAMMA]
-        numbers[GAMMA] = gamma
-        residual = wp.sqrt(gamma / numbers[GAMMA_FIRST])
-        residual_out[0] = residual
-        iterations[0] = iterations[0] + 1
-        left[0] = left[0] - 1
-        condition_out[0] = wp.where(residual > tolerance and left[0] > 0, 1, 0)
+        lane = first + wp.tid()
+        gamma = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            numbers[BETA] = gamma / numbers[GAMMA]
+            numbers[GAMMA] = gamma
+            f.update_status(gamma, 1, tolerance, first_norm, left, iterations, residual_out, condition_out)
 
     return SimpleNamespace(**locals())

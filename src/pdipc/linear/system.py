@@ -7,6 +7,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from pdipc.linear import spectrum
+from pdipc.linear.rows import Rows
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
@@ -18,8 +19,8 @@ class System:
     matrix: (n, n) scipy sparse matrix, kg/s^2. Rows may be empty (vertices of obstacles).
     free: (n,) bool; False for vertices whose position is prescribed: solvers read it and leave it as it is.
 
-    On the device: the off-diagonal entries of the free rows as compressed rows, the diagonal apart from them.
-    diagonal: (n,) A_ii where free, 0 elsewhere, kg/s^2.
+    rows: the off-diagonal entries of the free rows on the device.
+    diagonal: (n,) A_ii where free, 0 elsewhere, on the device, kg/s^2.
     Raises ValueError where the matrix is not square, not symmetric, or a free vertex has a diagonal entry that is not positive.
     """
 
@@ -34,20 +35,13 @@ class System:
         rows = sp.csr_matrix(rows)
         rows.eliminate_zeros()
         rows.sort_indices()
-        self.entries = rows.nnz
-        self.offsets = wp.array(rows.indptr.astype(np.int32), device=device.warp)
-        self.columns = wp.array(_at_least_one(rows.indices.astype(np.int32)), device=device.warp)
-        self.values = wp.array(_at_least_one(rows.data.astype(real.numpy)), device=device.warp)
+        self.rows = Rows(device, real, rows)
         self.diagonal = wp.array(np.where(free, matrix.diagonal(), 0.0).astype(real.numpy), device=device.warp)
 
     @functools.cached_property
     def interval(self) -> tuple[float, float]:
         """[lo, hi], which holds all eigenvalues of D^-1 A on the free vertices (with a margin)."""
         return spectrum.interval(self.matrix, self.free)
-
-
-def _at_least_one(values: np.ndarray) -> np.ndarray:
-    return values if values.size else np.zeros(1, dtype=values.dtype)
 
 
 def _check(matrix: sp.csr_matrix, free: np.ndarray) -> None:

@@ -1,0 +1,115 @@
+"""Sparse matrices laid out for products with vectors of 3-vectors.
+
+On the CPU compressed rows. On CUDA slices of 32 rows, one for each thread of a warp, padded to the longest row of the slice and
+stored entry by entry, so that neighbouring threads read neighbouring memory.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from pdipc.parallel import Device
+from pdipc.precision import Real
+
+SLICE = 32  # rows of a slice on CUDA
+
+
+class Rows:
+    """A sparse matrix of scalars on the device.
+
+    offsets: first entry of each row (CPU) or slice (CUDA). columns, values: (entries,), padded with zeros on the row's own column.
+    positions: (nnz,) host array, where the entries of the SciPy matrix went.
+    arguments: what `row_product` takes after the row.
+    """
+
+    def __init__(self, device: Device, real: Real, matrix: sp.csr_matrix):
+        if device.is_cuda:
+            offsets, columns, self.positions = _sliced(matrix)
+        else:
+            offsets, columns, self.positions = matrix.indptr, matrix.indices, np.arange(matrix.nnz)
+        values = np.zeros(max(1, len(columns)), dtype=real.numpy)
+        values[self.positions] = matrix.data
+        self.real, self.entries = real, len(columns)
+        self.offsets = wp.array(offsets.astype(np.int32), device=device.warp)
+        self.columns = wp.array(np.resize(columns, len(values)).astype(np.int32), device=device.warp)
+        self.values = wp.array(values, device=device.warp)
+
+    @property
+    def arguments(self) -> list[Any]:
+        return [self.offsets, self.columns, self.values]
+
+    @property
+    def bytes(self) -> int:
+        """Memory of entries and offsets."""
+        return self.entries * (4 + self.real.numpy.itemsize) + 4 * self.offsets.size
+
+
+def _sliced(matrix: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets of slices, padded columns, and the position of each entry."""
+    count = matrix.shape[0]
+    slices = -(-count // SLICE)
+    lengths = np.zeros(slices * SLICE, dtype=np.int64)
+    lengths[:count] = np.diff(matrix.indptr)
+    width = lengths.reshape(slices, SLICE).max(axis=1, initial=0)
+    offsets = np.concatenate([[0], np.cumsum(width * SLICE)])
+    entry = np.arange(offsets[-1])
+    row = np.repeat(np.arange(slices) * SLICE, width * SLICE) + entry % SLICE
+    columns = np.minimum(row, count - 1)
+    rows = np.repeat(np.arange(count), np.diff(matrix.indptr))
+    within = np.arange(matrix.nnz) - matrix.indptr[rows]
+    positions = offsets[rows // SLICE] + within * SLICE + rows % SLICE
+    columns[positions] = matrix.indices
+    return offsets, columns, positions
+
+
+# Two sums side by side, because an addition has to wait for the one before. On the CPU all three components are read and
+# multiplied as one register of four, whose last lane is the next vertex's and is dropped: vectors need one spare entry.
+_ROW_PRODUCT = """
+#if defined(__CUDA_ARCH__)
+    const int slice = i / SLICE;
+    const int high = offsets.data[slice + 1];
+    SCALAR a = 0, b = 0, c = 0;
+    for (int e = offsets.data[slice] + i % SLICE; e < high; e += SLICE) {
+        const SCALAR v = values.data[e];
+        const auto& p = x.data[columns.data[e]];
+        a += v * p.c[0]; b += v * p.c[1]; c += v * p.c[2];
+    }
+    return {a, b, c};
+#else
+    typedef SCALAR four __attribute__((vector_size(4 * sizeof(SCALAR)), aligned(sizeof(SCALAR))));
+    const int* column = columns.data;
+    const SCALAR* value = values.data;
+    const SCALAR* vertex = (const SCALAR*)x.data;
+    const int high = offsets.data[i + 1];
+    four a = {0, 0, 0, 0}, b = {0, 0, 0, 0};
+    int e = offsets.data[i];
+    for (; e + 1 < high; e += 2) {
+        a += value[e] * *(const four*)(vertex + 3 * (long long)column[e]);
+        b += value[e + 1] * *(const four*)(vertex + 3 * (long long)column[e + 1]);
+    }
+    if (e < high) { a += value[e] * *(const four*)(vertex + 3 * (long long)column[e]); }
+    a += b;
+    return {a[0], a[1], a[2]};
+#endif
+"""
+
+
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    """The product of one row with a vector of 3-vectors."""
+    scalar, vec3 = real.scalar, real.vec3
+
+    @wp.func_native(_ROW_PRODUCT.replace("SCALAR", f"wp::{real.name}").replace("SLICE", str(SLICE)))
+    def row_product(
+        i: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+    ) -> vec3: ...
+
+    return SimpleNamespace(row_product=row_product)
