@@ -177,7 +177,8 @@ def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
     elif not len(mesh.tets):
         if not placed.tetrahedralize:
             raise SceneError(
-                f"{where}: a solid needs tetrahedra, its mesh has triangles only; give a tetrahedral mesh or set tetrahedralize = true"
+                f"{where}: a solid needs tetrahedra, its mesh has triangles only; give a tetrahedral mesh, or set "
+                "tetrahedralize = true"
             )
         mesh = meshes.tetrahedralize(mesh, where)
     return mesh, mesh.vertices if start is None else start
@@ -296,8 +297,8 @@ def _attach(assembly: Assembly, scene: Scene) -> None:
         a, b = (_body(assembly, name, where) for name in table.bodies)
         if table.pairs is not None:
             pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
-            _in_range(a, table.pairs and [pair[0] for pair in table.pairs], where)
-            _in_range(b, table.pairs and [pair[1] for pair in table.pairs], where)
+            _in_range(a, pairs[:, 0].tolist(), where)
+            _in_range(b, pairs[:, 1].tolist(), where)
         else:
             near = cKDTree(assembly.positions[b.first : b.last])
             distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)

@@ -75,7 +75,7 @@ class Simulation(Table):
     solver_order: int = Field(2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
     budget_ms: Positive | None = Field(
         None,
-        description="Time after which a step takes no further outer iteration, ms; absent: none. Results then depend on the machine.",
+        description="Time after which a step takes no further outer iteration, ms; results then depend on the machine.",
     )
 
 
@@ -84,14 +84,14 @@ class Contact(Table):
 
     method: Literal["barrier", "paper"] = Field(
         "barrier",
-        description='"barrier" is force-consistent and converges to the IPC solution; "paper" is Eq. (6) of the paper as printed.',
+        description='"barrier" is force-consistent and converges to the IPC solution; "paper" is Eq. (6) as printed.',
     )
     activation_distance: Positive | None = Field(
         None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
     )
     minimum_separation: Positive | None = Field(
         None,
-        description="Gap that no pair of surfaces ever closes (xi), m; absent: 0.02 of the activation distance. A body may set its own.",
+        description="Gap that no pair of surfaces ever closes (xi), m; absent: 0.02 activation_distance. Bodies may differ.",
     )
     stiffness_scale: Positive = Field(
         3.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
@@ -203,7 +203,7 @@ class Placed(Table):
     )
     minimum_separation: Positive | None = Field(
         None,
-        description="Gap kept to a body of the same kind, such as the thickness of cloth, m; two bodies keep the mean of theirs. "
+        description="Gap kept between copies of this body, such as the thickness of cloth, m; two bodies keep the mean. "
         "Absent: that of `contact`.",
     )
 
@@ -406,7 +406,7 @@ class _Window(Table):
 
 
 class Wind(_Window):
-    """Pressure of moving air on surfaces: each triangle feels drag air_density / 2 |u.n| (u.n) area n, u the air's velocity past it."""
+    """Pressure of moving air: air_density / 2 drag area |u.n| (u.n) n on a triangle of normal n, u the air's velocity past it."""
 
     kind: Literal["wind"] = "wind"
     velocity: Vector = Field(description="Velocity of the air, m/s.")

@@ -1,0 +1,327 @@
+"""What is refused before a simulation begins, with every finding at once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from pdipc import boxes
+from pdipc.scene import meshes
+from pdipc.scene.assembly import AssembledBody, Assembly, assemble, load_mesh
+from pdipc.scene.errors import SceneError
+from pdipc.scene.schema import Scene
+from pdipc.witness import find_intersections
+
+FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
+SEPARATION_ULPS = 100  # a minimum separation of fewer roundings of a coordinate is no protection
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that must be put right. where: bodies or keys. found: what is wrong. right: what would be right."""
+
+    where: str
+    found: str
+    right: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.found}; {self.right}"
+
+
+def check(scene: Scene | Assembly) -> list[Finding]:
+    """Everything about a scene that would be refused; empty where it can be simulated."""
+    if isinstance(scene, Assembly):
+        return _check(scene, "float64")
+    findings = []
+    for placed in (*scene.bodies, *scene.obstacles):
+        try:
+            load_mesh(placed)
+        except SceneError as error:
+            findings.append(Finding("meshes", str(error), "put this right first"))
+    if findings:
+        return findings
+    try:
+        assembly = assemble(scene)
+    except SceneError as error:
+        return [Finding("scene", str(error), "put this right first")]
+    return _check(assembly, "float32" if scene.simulation.precision == "float32" else "float64")
+
+
+def refuse(scene: Scene, assembly: Assembly | None = None) -> None:
+    """Raises SceneError with all findings where `scene` (assembled, if it is at hand) cannot be simulated."""
+    findings = check(scene if assembly is None else assembly)
+    if findings:
+        name = f'scene "{scene.title}"' if scene.title else "the scene"
+        raise SceneError("\n  ".join([f"{name} cannot be simulated; found {len(findings)}:", *map(str, findings)]))
+
+
+def smallest_separation(assembly: Assembly, precision: str) -> float:
+    """The least minimum separation, m, that means something at these coordinates in "float32" or "float64"."""
+    return float(SEPARATION_ULPS * np.spacing(np.abs(assembly.positions).max().astype(precision)))
+
+
+def _check(assembly: Assembly, precision: str) -> list[Finding]:
+    findings = [finding for body in assembly.bodies for finding in _numbers(assembly, body)]
+    if findings:  # geometry is meaningless then
+        return findings
+    for body in assembly.bodies:
+        findings += _elements(assembly, body)
+    findings += _selections(assembly)
+    findings += _separation(assembly, precision)
+    touching, found = _intersections(assembly)
+    return findings + found + list(_too_close(assembly, touching)) + list(_inside(assembly, touching))
+
+
+def _label(body: AssembledBody) -> str:
+    return f'{"obstacle" if body.kinematic else "body"} "{body.name}"'
+
+
+def _at(point: np.ndarray) -> str:
+    return f"({point[0]:.4g}, {point[1]:.4g}, {point[2]:.4g})"
+
+
+def _numbers(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
+    for name in ("rest_positions", "positions", "velocities"):
+        bad = np.flatnonzero(~np.isfinite(getattr(assembly, name)[body.first : body.last]).all(axis=1))
+        if len(bad):
+            yield Finding(
+                _label(body), f"{name} of {len(bad)} vertices are not finite, first vertex {bad[0]}", "they must be numbers"
+            )
+            return
+
+
+def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
+    label, first = _label(body), body.first
+    kind, elements = ("tets", body.tets) if body.kind == "solid" else ("triangles", body.triangles)
+    corners = assembly.rest_positions[elements]
+    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
+    if body.kind == "solid":
+        volumes = meshes.tet_volumes(assembly.rest_positions, elements)
+        inverted = np.flatnonzero(volumes < -FLAT * longest**3)
+        if len(inverted):
+            example = f"tets[{inverted[0]}] = {(elements[inverted[0]] - first).tolist()}"
+            found = f"{len(inverted)} of {len(elements)} tets are inverted, first {example}"
+            yield Finding(label, found, "every tet needs positive volume: swap two of its vertices")
+        flat = np.flatnonzero(np.abs(volumes) <= FLAT * longest**3)
+    else:
+        flat = np.flatnonzero(meshes.triangle_areas(assembly.rest_positions, elements) <= FLAT * longest**2)
+    if len(flat):
+        measure = "volume" if body.kind == "solid" else "area"
+        example = f"{kind}[{flat[0]}] = {(elements[flat[0]] - first).tolist()}"
+        found = f"{len(flat)} of {len(elements)} {kind} have no {measure}, first {example}"
+        yield Finding(label, found, "remove them or move their vertices apart")
+    _, counts = np.unique(np.sort(elements, axis=1), axis=0, return_counts=True)
+    if counts.max() > 1:
+        found = f"{np.count_nonzero(counts > 1)} {kind} are there more than once"
+        yield Finding(label, found, "each must be there once")
+    else:
+        sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, counts = np.unique(sides, axis=0, return_counts=True)
+        crowded = np.flatnonzero(counts > 2)
+        if len(crowded):
+            edge = (edges[crowded[0]] - first).tolist()
+            found = f"{len(crowded)} edges of its surface belong to more than two triangles, first {edge}"
+            yield Finding(label, found, "the surface must be a manifold: split it there")
+    unused = np.setdiff1d(np.arange(first, body.last), elements)
+    if len(unused):
+        found = f"{len(unused)} vertices belong to no {kind[:-1]}, first vertex {unused[0] - first}"
+        yield Finding(label, found, "remove them")
+
+
+def _selections(assembly: Assembly) -> Iterator[Finding]:
+    held: dict[int, str] = {}
+    for number, pin in enumerate(assembly.pins):
+        if len(pin.vertices) == 0:
+            yield Finding(
+                f'body "{pin.body}"',
+                "a pin selects no vertex",
+                "places are those at the start, in m, in the scene's coordinates",
+            )
+        elif pin.stiffness is None:
+            twice = [vertex for vertex in pin.vertices.tolist() if vertex in held]
+            if twice:
+                found = f"{len(twice)} vertices are held exactly by more than one pin"
+                yield Finding(f'body "{pin.body}"', found, "give them one pin, or all but one a stiffness")
+            held.update((vertex, str(number)) for vertex in pin.vertices.tolist())
+    for number, attachment in enumerate(assembly.attachments):
+        if len(attachment.vertices_a) == 0:
+            yield Finding(f"attachments[{number}]", "attaches no vertex", 'raise "within", or give pairs')
+        elif np.any(attachment.vertices_a == attachment.vertices_b):
+            yield Finding(f"attachments[{number}]", "attaches a vertex to itself", "give two different vertices")
+    for number, force in enumerate(assembly.forces):
+        if len(force.vertices) == 0:
+            yield Finding(
+                f"forces[{number}]", "acts on no vertex", "places are those at the start, in m, in the scene's coordinates"
+            )
+
+
+def _separation(assembly: Assembly, precision: str) -> Iterator[Finding]:
+    least = smallest_separation(assembly, precision)
+    small = [body for body in assembly.bodies if 2 * body.half_separation < least]
+    if small:
+        reach = np.abs(assembly.positions).max()
+        gap = 2 * small[0].half_separation
+        found = f"minimum separation {gap:.3g} m is lost in the rounding of {precision} coordinates up to {reach:.4g} m"
+        right = f"it must be at least {least:.3g} m: raise minimum_separation or activation_distance, or use float64"
+        yield Finding(", ".join(map(_label, small[:5])), found, right)
+
+
+def _scripted(assembly: Assembly) -> np.ndarray:
+    mask = np.zeros(len(assembly.positions), dtype=bool)
+    mask[assembly.kinematic_vertices] = True
+    return mask
+
+
+def _intersections(assembly: Assembly) -> tuple[set[tuple[int, int]], list[Finding]]:
+    """Pairs of bodies that intersect, i <= j, and what there is to say."""
+    triangles = assembly.triangles
+    pairs = find_intersections(assembly.positions, triangles, _scripted(assembly))
+    owners = np.sort(assembly.body_of_vertex[triangles[pairs][:, :, 0]], axis=1)
+    findings, touching = [], set()
+    for i, j in np.unique(owners, axis=0):
+        own = pairs[np.all(owners == (i, j), axis=1)]
+        place = assembly.positions[triangles[own[0]]].mean(axis=(0, 1))
+        where = _label(assembly.bodies[i]) + (f" and {_label(assembly.bodies[j])}" if i != j else "")
+        found = f"{len(own)} pairs of triangles intersect at the start, one near {_at(place)} m"
+        findings.append(Finding(where, found, "move them apart" if i != j else "the surface must not pass through itself"))
+        touching.add((int(i), int(j)))
+    return touching, findings
+
+
+def _too_close(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Finding]:
+    """Pairs of bodies that come as near as their minimum separation."""
+    x, owner = assembly.positions, assembly.body_of_vertex
+    reach = np.array([body.half_separation for body in assembly.bodies])
+    kinematic = np.array([body.kinematic for body in assembly.bodies])
+    low = np.array([x[body.first : body.last].min(axis=0) for body in assembly.bodies]) - reach[:, None]
+    high = np.array([x[body.first : body.last].max(axis=0) for body in assembly.bodies]) + reach[:, None]
+
+    def near_others(primitives: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The primitives whose boxes reach into another body's box, and their boxes."""
+        corners, margin = x[primitives], reach[owner[primitives[:, 0]]][:, None]
+        p_low, p_high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
+        met = boxes.overlapping(p_low, p_high, low, high)
+        kept = np.unique(met[owner[primitives[met[:, 0], 0]] != met[:, 1], 0])
+        return primitives[kept], p_low[kept], p_high[kept]
+
+    def candidates(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        pairs = boxes.overlapping(*a[1:], *b[1:])
+        first, second = a[0][pairs[:, 0]], b[0][pairs[:, 1]]
+        i, j = owner[first[:, 0]], owner[second[:, 0]]
+        apart = (i != j) & ~(kinematic[i] & kinematic[j])
+        return first[apart], second[apart]
+
+    triangles = assembly.triangles
+    edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    faces, lines = near_others(triangles), near_others(edges)
+    points = near_others(np.unique(triangles)[:, None])
+    v, t = candidates(points, faces)
+    e, f = candidates(lines, lines)
+    distances = np.concatenate([vertex_triangle_distances(x[v[:, 0]], x[t]), edge_edge_distances(x[e], x[f])])
+    first, second = np.concatenate([v[:, 0], e[:, 0]]), np.concatenate([t[:, 0], f[:, 0]])
+    pairs = np.sort(np.column_stack([owner[first], owner[second]]), axis=1)
+    places = np.concatenate([x[v[:, 0]], x[e].mean(axis=1)])
+    close = distances <= reach[pairs[:, 0]] + reach[pairs[:, 1]]
+    distances, pairs, places = distances[close], pairs[close], places[close]
+    for i, j in np.unique(pairs, axis=0):
+        if (int(i), int(j)) in touching:
+            continue
+        own = np.all(pairs == (i, j), axis=1)
+        nearest = np.flatnonzero(own)[np.argmin(distances[own])]
+        example = f"the nearest {distances[nearest]:.3g} m apart near {_at(places[nearest])} m"
+        found = f"{np.count_nonzero(own)} pairs of vertices, edges or triangles start too close, {example}"
+        right = f"their gap must be more than the minimum separation of {reach[i] + reach[j]:.3g} m"
+        yield Finding(f"{_label(assembly.bodies[i])} and {_label(assembly.bodies[j])}", found, right)
+
+
+def _inside(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Finding]:
+    """Bodies that start inside another; a closed obstacle that faces inward (of negative volume) is a container."""
+    x = assembly.positions
+    parts = [_components(body) for body in assembly.bodies]
+    for i, outer in enumerate(assembly.bodies):
+        corners = x[outer.triangles]
+        if not _is_closed(outer.triangles) or np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) <= 0:
+            continue
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        for j, inner in enumerate(assembly.bodies):
+            if i == j or (min(i, j), max(i, j)) in touching or (outer.kinematic and inner.kinematic):
+                continue
+            for vertex in parts[j]:
+                if np.all(low < x[vertex]) and np.all(x[vertex] < high) and winding_number(x[vertex], corners) > 0.5:
+                    found = f"starts inside {_label(outer)}, at {_at(x[vertex])} m"
+                    yield Finding(
+                        _label(inner), found, "move it out; an obstacle that is to hold bodies must face inward or be open"
+                    )
+                    break
+
+
+def _components(body: AssembledBody) -> np.ndarray:
+    """One vertex of each connected part of a body's surface."""
+    count = body.last - body.first
+    edges = (body.triangles[:, [[0, 1], [1, 2]]].reshape(-1, 2) - body.first).T
+    graph = scipy.sparse.coo_matrix((np.ones(edges.shape[1]), edges), shape=(count, count))
+    used = np.unique(body.triangles) - body.first
+    _, label = connected_components(graph, directed=False)
+    return used[np.unique(label[used], return_index=True)[1]] + body.first
+
+
+def _is_closed(triangles: np.ndarray) -> bool:
+    """Whether every edge is passed once in each direction."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forward, backward = (np.unique(way, axis=0) for way in (sides, sides[:, ::-1]))
+    return len(forward) == len(sides) and np.array_equal(forward, backward)
+
+
+def winding_number(point: np.ndarray, corners: np.ndarray) -> float:
+    """How often the surface of triangles (m, 3, 3) goes around `point` (3,): 1 inside a closed outward one, 0 outside.
+
+    Solid angles after van Oosterom and Strackee 1983.
+    """
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (b, c), (c, a)))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    return float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi))
+
+
+def point_segment_distances(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n,) distances of points p from segments a b, all (n, 3), m."""
+    d = b - a
+    length = np.einsum("ij,ij->i", d, d)
+    s = np.clip(np.einsum("ij,ij->i", p - a, d) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    return np.linalg.norm(p - a - s[:, None] * d, axis=1)
+
+
+def vertex_triangle_distances(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(n,) distances of points p (n, 3) from triangles (n, 3, 3), m."""
+    corners = [triangles[:, k] for k in range(3)]
+    distance = np.min([point_segment_distances(p, corners[k], corners[k - 2]) for k in range(3)], axis=0)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    inside = np.ones(len(p), dtype=bool)
+    for k in range(3):
+        a, b = corners[k], corners[k - 2]
+        inside &= np.einsum("ij,ij->i", np.cross(b - a, p - a), normal) > 0
+    length = np.linalg.norm(normal, axis=1)
+    above = np.abs(np.einsum("ij,ij->i", p - corners[0], normal)) / np.where(length > 0, length, 1.0)
+    return np.where(inside, above, distance)
+
+
+def edge_edge_distances(e: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """(n,) distances of segments e and f, both (n, 2, 3), m."""
+    distance = np.min(
+        [point_segment_distances(e[:, k], f[:, 0], f[:, 1]) for k in (0, 1)]
+        + [point_segment_distances(f[:, k], e[:, 0], e[:, 1]) for k in (0, 1)],
+        axis=0,
+    )
+    u, v, w = e[:, 1] - e[:, 0], f[:, 1] - f[:, 0], e[:, 0] - f[:, 0]
+    uu, uv, vv, uw, vw = (np.einsum("ij,ij->i", a, b) for a, b in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    normal = np.cross(u, v)
+    square = np.einsum("ij,ij->i", normal, normal)
+    skew = square > 1e-24 * uu * vv
+    square = np.where(skew, square, 1.0)
+    s, t = (uv * vw - vv * uw) / square, (uu * vw - uv * uw) / square
+    across = np.abs(np.einsum("ij,ij->i", w, normal)) / np.sqrt(square)
+    inside = skew & (s > 0) & (s < 1) & (t > 0) & (t < 1)
+    return np.where(inside, np.minimum(across, distance), distance)

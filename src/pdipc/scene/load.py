@@ -1,0 +1,146 @@
+"""Scenes from files: TOML written by people, JSON written by a run; and the scenes that come with the package."""
+
+import difflib
+import json
+import tomllib
+import typing
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from pdipc.scene.errors import SceneError
+from pdipc.scene.schema import Scene
+
+BUNDLED = Path(__file__).parent.parent / "scenes"
+
+
+def bundled_scenes() -> dict[str, Path]:
+    """Names of the scenes that come with the package, and their files."""
+    return {path.stem: path for path in sorted(BUNDLED.glob("*.toml"))}
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Reads a scene from a .toml or .json file, or the bundled scene of that name.
+
+    Mesh paths in the file are relative to it. Raises SceneError; its message names the file and, for every problem at once, the
+    key, the value found, and what is allowed.
+    """
+    file = bundled_scenes().get(str(path), Path(path))
+    if not file.is_file():
+        near = difflib.get_close_matches(str(path), bundled_scenes(), n=1)
+        hint = f'did you mean "{near[0]}"? ' if near else ""
+        raise SceneError(f'"{path}": there is no such file; {hint}bundled scenes: {", ".join(bundled_scenes())}')
+    try:
+        if file.suffix == ".json":
+            data = json.loads(file.read_text(encoding="utf-8"))
+        elif file.suffix == ".toml":
+            data = tomllib.loads(file.read_text(encoding="utf-8"))
+        else:
+            raise SceneError(f'"{file}": a scene file ends in .toml or .json')
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f'"{file}": is not valid {file.suffix[1:].upper()}: {error}') from error
+    try:
+        return Scene.model_validate(data, context={"folder": file.parent})
+    except ValidationError as error:
+        lines = explain(error, data)
+        raise SceneError(f'"{file}": ' + (lines[0] if len(lines) == 1 else "\n  ".join(["", *lines]))) from error
+
+
+def explain(error: ValidationError, data: Any) -> list[str]:
+    """One line for each thing wrong in `data`: key, value found, what is allowed."""
+    return [_line(problem, data) for problem in error.errors()]
+
+
+def _line(problem: Any, data: Any) -> str:
+    keys, models = _follow(problem["loc"], data)
+    where = _path(keys, data)
+    kind, found = problem["type"], _short(problem["input"])
+    if kind == "extra_forbidden":
+        allowed = sorted({name for model in models for name in model.model_fields})
+        near = difflib.get_close_matches(str(keys[-1]), allowed, n=1)
+        return (
+            f"{where} = {found}: unknown key"
+            + (f'; did you mean "{near[0]}"?' if near else "")
+            + f" (allowed: {', '.join(allowed)})"
+        )
+    if kind == "missing":
+        return f"{where}: is missing{_about(keys, models)}"
+    if kind == "union_tag_not_found":
+        return f"{where}: needs kind = {_kinds(problem)}"
+    if kind == "union_tag_invalid":
+        return (
+            f'{where}.{problem["ctx"]["discriminator"].strip(chr(39))} = "{problem["ctx"]["tag"]}": must be {_kinds(problem)}'
+        )
+    said = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("should", "must")
+    value = "" if isinstance(problem["input"], dict | BaseModel) else f" = {found}"
+    return f"{where}{value}: {said}{_about(keys, models)}"
+
+
+def _kinds(problem: Any) -> str:
+    tags = problem.get("ctx", {}).get("expected_tags")
+    return (
+        tags.replace("'", '"').replace(", ", " or ")
+        if tags
+        else '"solid" or "cloth" for a body, "wind" or "vertices" for a force'
+    )
+
+
+def _about(keys: list[str | int], models: list[type[BaseModel]]) -> str:
+    for model in models:
+        field = model.model_fields.get(str(keys[-1])) if keys else None
+        if field is not None and field.description:
+            return f" ({field.description})"
+    return ""
+
+
+def _follow(loc: tuple[str | int, ...], data: Any) -> tuple[list[str | int], list[type[BaseModel]]]:
+    """The keys of `loc` without the tags that pydantic puts in for unions, and the models that may hold the last key."""
+    keys: list[str | int] = []
+    models, holders = [Scene], [Scene]
+    for place, part in enumerate(loc):
+        is_key = isinstance(part, int) or (isinstance(data, dict) and part in data) or place == len(loc) - 1
+        if not is_key or (keys and not isinstance(data, dict | list)):
+            models = [model for model in models if part in _tags(model)] or models
+            continue
+        keys.append(part)
+        if isinstance(part, str):
+            holders = models
+            models = [
+                found
+                for model in models
+                if part in model.model_fields
+                for found in _models(model.model_fields[part].annotation)
+            ]
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            data = None
+    return keys, holders
+
+
+def _tags(model: type[BaseModel]) -> set[Any]:
+    return {model.__name__.lower()} | {
+        model.model_fields[name].default for name in ("kind", "shape") if name in model.model_fields
+    }
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in typing.get_args(annotation) for model in _models(part)]
+
+
+def _path(keys: list[str | int], data: Any) -> str:
+    text = ""
+    for key in keys:
+        data = data[key] if isinstance(data, dict | list) and (isinstance(key, int) or key in data) else None
+        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else key
+        if isinstance(key, int) and isinstance(data, dict) and isinstance(data.get("name"), str):
+            text += f' ("{data["name"]}")'
+    return text or "the scene"
+
+
+def _short(value: Any) -> str:
+    text = f'"{value}"' if isinstance(value, str) else str(value)
+    return text if len(text) <= 80 else text[:77] + "..."
