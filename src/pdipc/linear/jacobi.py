@@ -8,6 +8,7 @@ omega = 1 without.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,8 +17,6 @@ from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
 from pdipc.linear.system import System
 from pdipc.precision import Real
-
-CHECK = 4  # sweeps between two looks at the residual; even, so that the result is where the start was
 
 
 def chebyshev_factors(rho: float, count: int) -> np.ndarray:
@@ -32,10 +31,12 @@ class Jacobi(Solver):
     """Weighted Jacobi iteration.
 
     weight: w; by default 2/(lo + hi) from the spectral interval. Plain Jacobi, w = 1, diverges where hi >= 2.
-    The residual is looked at every CHECK sweeps, and is the one before the last sweep.
+    The residual is looked at every `chunk` sweeps, and is the one before the last sweep.
     """
 
     accelerated = False
+    order = 1  # sweeps that count as one iteration
+    chunk = 4  # sweeps between two looks at the residual; even, so that the result is where the start was
 
     def __init__(self, system: System, tolerance: float, max_iterations: int, weight: float | None = None):
         super().__init__(system, tolerance, max_iterations)
@@ -43,17 +44,24 @@ class Jacobi(Solver):
         hi = max(hi, 1.0)  # contacts may move eigenvalues up to 1
         self.weight = 2.0 / (lo + hi) if weight is None else weight
         self.rho = max(abs(1.0 - self.weight * lo), abs(1.0 - self.weight * hi))
-        sweeps = -(-max_iterations // CHECK) * CHECK
+        sweeps = max_iterations + self.chunk
         factors = chebyshev_factors(self.rho, sweeps) if self.accelerated else np.ones(sweeps)
         self._factors = wp.array(factors.astype(self.real.numpy), device=self.device.warp)
         self._x, self._before, self._w = (self.zeros(self.real.vec3) for _ in range(3))
         self._kernels = kernels(self.real)
 
+    @property
+    def weights(self) -> list[Any]:
+        """w, the factors omega, and what tells the number of the sweep."""
+        return [self.real.scalar(self.weight), self._factors, self.left, self.max_iterations]
+
+    def sweep(self, source: wp.array, target: wp.array, step: int, b: wp.array, coupled: int = 0) -> None:
+        """Launches the sweep number `step` of the current group of sweeps, or with -1 only the residual of `source`."""
+        matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
+        self.sums.launch(self._kernels.sweep, [*matrix, *self.weights, step, coupled, self._w, source, target, self.partial])
+
     def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
         apply = contact.apply if contact is not None else None
-        k, sums = self._kernels, self.sums
-        matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
-        weights = [self.real.scalar(self.weight), self._factors, self.left, self.max_iterations]
         self.invert_diagonal(contact)
         self.copy(self._x, x)
         self.copy(self._before, x)
@@ -63,17 +71,18 @@ class Jacobi(Solver):
         def sweep(source: wp.array, target: wp.array, step: int) -> None:
             if apply:
                 apply(source, self._w)
-            sums.launch(k.sweep, [*matrix, *weights, step, int(apply is not None), self._w, source, target, self.partial])
+            self.sweep(source, target, step, b, int(apply is not None))
 
         status = [self.first, self.left, self.iterations, self.residual, self.condition]
         sweep(self._x, self._before, -1)
-        sums.conclude(k.begin, [self.partial, sums.slots, reference, *self.limits, *status])
+        self.sums.conclude(self._kernels.begin, [self.partial, self.sums.slots, reference, *self.limits, *status])
 
         def iterate() -> None:
-            for step in range(0, CHECK, 2):
+            for step in range(0, self.chunk, 2):
                 sweep(self._x, self._before, step)
                 sweep(self._before, self._x, step + 1)
-            sums.conclude(k.check, [self.partial, sums.slots, *self.limits, *status])
+            check = [self.partial, self.sums.slots, self.chunk, self.chunk // self.order, *self.limits, *status]
+            self.sums.conclude(self._kernels.check, check)
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -91,7 +100,6 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
     f = shared.functions(real)
-    check_every = wp.constant(CHECK)
 
     @wp.kernel(module=module)
     def sweep(
@@ -160,6 +168,8 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         partial: wp.array(dtype=scalar),
         slots: int,
+        sweeps: int,
+        counted: int,
         tolerance: scalar,
         max_iterations: int,
         first_norm: wp.array(dtype=scalar),
@@ -171,6 +181,6 @@ def kernels(real: Real) -> SimpleNamespace:
         lane = first + wp.tid()
         gamma = f.sum_partials(partial, slots, lane)
         if lane == 0:
-            f.update_status(gamma, check_every, tolerance, first_norm, left, iterations, residual_out, condition_out)
+            f.update_status(gamma, sweeps, counted, tolerance, first_norm, left, iterations, residual_out, condition_out)
 
     return SimpleNamespace(**locals())

@@ -50,6 +50,13 @@ class Sums:
         else:
             self.device.launch(kernel, self.slots, [BLOCK, self.count, *inputs], grain=BLOCK)
 
+    def launch_groups(self, kernel: wp.Kernel, groups: int, inputs: list[Any], grain: int = BLOCK) -> None:
+        """Runs `kernel(first, *inputs)` with one thread for each group of vertices on the CPU, one block of threads on CUDA."""
+        if self.device.is_cuda:
+            wp.launch(kernel, groups * BLOCK, [0, *inputs], device=self.device.warp, block_dim=BLOCK)
+        else:
+            self.device.launch(kernel, groups, inputs, grain=grain)
+
     def conclude(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         """Runs `kernel(first, *inputs)` in one thread on the CPU and in one block of threads on CUDA."""
         if self.device.is_cuda:
@@ -114,6 +121,7 @@ def functions(real: Real) -> SimpleNamespace:
     def update_status(
         gamma: scalar,
         done: int,
+        counted: int,
         tolerance: scalar,
         first_norm: wp.array(dtype=scalar),
         left: wp.array(dtype=wp.int32),
@@ -121,10 +129,10 @@ def functions(real: Real) -> SimpleNamespace:
         residual_out: wp.array(dtype=scalar),
         condition_out: wp.array(dtype=wp.int32),
     ):
-        """What a solve notes after `done` more iterations."""
+        """What a solve notes after `done` more steps towards its limit, which count as `counted` iterations."""
         residual = wp.sqrt(gamma) / first_norm[0]
         residual_out[0] = residual
-        iterations[0] = iterations[0] + done
+        iterations[0] = iterations[0] + counted
         left[0] = left[0] - done
         condition_out[0] = wp.where(residual > tolerance and left[0] > 0, 1, 0)
 

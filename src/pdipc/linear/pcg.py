@@ -42,13 +42,17 @@ _ADVANCE = """
 
 
 class Pcg(Solver):
-    """Preconditioned conjugate gradients."""
+    """Preconditioned conjugate gradients.
+
+    steps: (max_iterations, 2) on the device, alpha and beta of each iteration of the last solve.
+    """
 
     def __init__(self, system: System, tolerance: float, max_iterations: int):
         super().__init__(system, tolerance, max_iterations)
         vec3, scalar = self.real.vec3, self.real.scalar
         self._r, self._u, self._w, self._p, self._s = (self.zeros(vec3) for _ in range(5))
         self._numbers = self.zeros(scalar, 3)
+        self.steps = wp.zeros((max_iterations, 2), dtype=scalar, device=self.device.warp)
         self._kernels = kernels(self.real)
 
     def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
@@ -76,7 +80,7 @@ class Pcg(Solver):
             sums.conclude(k.find_alpha, [self.partial, sums.slots, self._numbers, self.left])
             vectors = [self._w, self._p, self._s, x, self._r, self._u]
             sums.launch(k.update, [*preconditioner, self._numbers, coupled, *vectors, self.partial])
-            sums.conclude(k.find_beta, [self.partial, sums.slots, self._numbers, *self.limits, *status])
+            sums.conclude(k.find_beta, [self.partial, sums.slots, self._numbers, self.steps, *self.limits, *status])
 
         self.device.loop(self.condition, iterate)
 
@@ -241,7 +245,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 numbers[ALPHA] = gamma / curvature
             else:
                 numbers[ALPHA] = scalar(0.0)
-                left[0] = 0
+                left[0] = 1
 
     @wp.kernel(module=module)
     def find_beta(
@@ -249,6 +253,7 @@ def kernels(real: Real) -> SimpleNamespace:
         partial: wp.array(dtype=scalar),
         slots: int,
         numbers: wp.array(dtype=scalar),
+        steps_out: wp.array2d(dtype=scalar),
         tolerance: scalar,
         max_iterations: int,
         first_norm: wp.array(dtype=scalar),
@@ -260,8 +265,11 @@ def kernels(real: Real) -> SimpleNamespace:
         lane = first + wp.tid()
         gamma = f.sum_partials(partial, slots, lane)
         if lane == 0:
-            numbers[BETA] = gamma / numbers[GAMMA]
+            beta = gamma / numbers[GAMMA]
+            steps_out[max_iterations - left[0], 0] = numbers[ALPHA]
+            steps_out[max_iterations - left[0], 1] = beta
+            numbers[BETA] = beta
             numbers[GAMMA] = gamma
-            f.update_status(gamma, 1, tolerance, first_norm, left, iterations, residual_out, condition_out)
+            f.update_status(gamma, 1, 1, tolerance, first_norm, left, iterations, residual_out, condition_out)
 
     return SimpleNamespace(**locals())

@@ -4,6 +4,7 @@ from typing import Any
 
 from pdipc.linear.jacobi import Chebyshev, Jacobi
 from pdipc.linear.pcg import Pcg
+from pdipc.linear.powers import MatrixPowers
 from pdipc.linear.solver import Solver
 from pdipc.linear.system import System
 
@@ -11,6 +12,7 @@ SOLVERS: dict[str, type[Solver]] = {
     "pcg": Pcg,
     "jacobi": Jacobi,
     "chebyshev": Chebyshev,
+    "matrix-powers": MatrixPowers,
 }
 
 

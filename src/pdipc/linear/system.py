@@ -6,7 +6,6 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from pdipc.linear import spectrum
 from pdipc.linear.rows import Rows
 from pdipc.parallel import Device
 from pdipc.precision import Real
@@ -40,8 +39,10 @@ class System:
 
     @functools.cached_property
     def interval(self) -> tuple[float, float]:
-        """[lo, hi], which holds all eigenvalues of D^-1 A on the free vertices (with a margin)."""
-        return spectrum.interval(self.matrix, self.free)
+        """[lo, hi], which holds all eigenvalues of D^-1 A on the free vertices (see spectrum.py)."""
+        from pdipc.linear import spectrum
+
+        return spectrum.interval(self)
 
 
 def _check(matrix: sp.csr_matrix, free: np.ndarray) -> None:
