@@ -27,6 +27,14 @@ def chebyshev_factors(rho: float, count: int) -> np.ndarray:
     return factors
 
 
+def weight_and_radius(system: System, weight: float | None = None) -> tuple[float, float]:
+    """w, by default 2/(lo + hi), and the spectral radius of I - w D^-1 A, which is (hi - lo)/(hi + lo) for the default."""
+    lo, hi = system.interval
+    hi = max(hi, 1.0)  # contacts may move eigenvalues up to 1
+    weight = 2.0 / (lo + hi) if weight is None else weight
+    return weight, max(abs(1.0 - weight * lo), abs(1.0 - weight * hi))
+
+
 class Jacobi(Solver):
     """Weighted Jacobi iteration.
 
@@ -40,10 +48,7 @@ class Jacobi(Solver):
 
     def __init__(self, system: System, tolerance: float, max_iterations: int, weight: float | None = None):
         super().__init__(system, tolerance, max_iterations)
-        lo, hi = system.interval
-        hi = max(hi, 1.0)  # contacts may move eigenvalues up to 1
-        self.weight = 2.0 / (lo + hi) if weight is None else weight
-        self.rho = max(abs(1.0 - self.weight * lo), abs(1.0 - self.weight * hi))
+        self.weight, self.rho = weight_and_radius(system, weight)
         sweeps = max_iterations + self.chunk
         factors = chebyshev_factors(self.rho, sweeps) if self.accelerated else np.ones(sweeps)
         self._factors = wp.array(factors.astype(self.real.numpy), device=self.device.warp)

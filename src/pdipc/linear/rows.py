@@ -26,8 +26,8 @@ class Rows:
     arguments: what `row_product` takes after the row.
     """
 
-    def __init__(self, device: Device, real: Real, matrix: sp.csr_matrix):
-        if device.is_cuda:
+    def __init__(self, device: Device, real: Real, matrix: sp.csr_matrix, sliced: bool | None = None):
+        if device.is_cuda if sliced is None else sliced:
             offsets, columns, self.positions = _sliced(matrix)
         else:
             offsets, columns, self.positions = matrix.indptr, matrix.indices, np.arange(matrix.nnz)

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+from pdipc.linear.aggregated import AJacobi
+from pdipc.linear.direct import Direct
+from pdipc.linear.gauss_seidel import GaussSeidel, Sor
 from pdipc.linear.jacobi import Chebyshev, Jacobi
 from pdipc.linear.pcg import Pcg
 from pdipc.linear.powers import MatrixPowers
@@ -12,7 +15,11 @@ SOLVERS: dict[str, type[Solver]] = {
     "pcg": Pcg,
     "jacobi": Jacobi,
     "chebyshev": Chebyshev,
+    "a-jacobi": AJacobi,
     "matrix-powers": MatrixPowers,
+    "gauss-seidel": GaussSeidel,
+    "sor": Sor,
+    "direct": Direct,
 }
 
 
