@@ -49,32 +49,33 @@ def load_scene(path: str | Path) -> Scene:
 
 def explain(error: ValidationError, data: Any) -> list[str]:
     """One line for each thing wrong in `data`: key, value found, what is allowed."""
-    return [_line(problem, data) for problem in error.errors()]
+    lines: dict[tuple[str, str], str] = {}
+    for problem in error.errors():
+        where, said, about = _line(problem, data)
+        # a key that may be of two kinds is reported by pydantic for each of them
+        lines[where, about] = f"{lines[where, about]}, or: {said}" if (where, about) in lines else said
+    return [f"{where}: {said}{about}" for (where, about), said in lines.items()]
 
 
-def _line(problem: Any, data: Any) -> str:
+def _line(problem: Any, data: Any) -> tuple[str, str, str]:
+    """Key and value found, what is wrong with it, what the key means."""
     keys, models = _follow(problem["loc"], data)
     where = _path(keys, data)
     kind, found = problem["type"], _short(problem["input"])
     if kind == "extra_forbidden":
         allowed = sorted({name for model in models for name in model.model_fields})
         near = difflib.get_close_matches(str(keys[-1]), allowed, n=1)
-        return (
-            f"{where} = {found}: unknown key"
-            + (f'; did you mean "{near[0]}"?' if near else "")
-            + f" (allowed: {', '.join(allowed)})"
-        )
+        hint = f'; did you mean "{near[0]}"?' if near else ""
+        return f"{where} = {found}", f"unknown key{hint} (allowed: {', '.join(allowed)})", ""
     if kind == "missing":
-        return f"{where}: is missing{_about(keys, models)}"
+        return where, "is missing", _about(keys, models)
     if kind == "union_tag_not_found":
-        return f"{where}: needs kind = {_kinds(problem)}"
+        return where, f"needs kind = {_kinds(problem)}", ""
     if kind == "union_tag_invalid":
-        return (
-            f'{where}.{problem["ctx"]["discriminator"].strip(chr(39))} = "{problem["ctx"]["tag"]}": must be {_kinds(problem)}'
-        )
+        return f'{where}.kind = "{problem["ctx"]["tag"]}"', f"must be {_kinds(problem)}", ""
     said = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("should", "must")
-    value = "" if isinstance(problem["input"], dict | BaseModel) else f" = {found}"
-    return f"{where}{value}: {said}{_about(keys, models)}"
+    value = "" if isinstance(problem["input"], BaseModel) else f" = {found}"
+    return where + value, said, _about(keys, models)
 
 
 def _kinds(problem: Any) -> str:
@@ -98,9 +99,9 @@ def _follow(loc: tuple[str | int, ...], data: Any) -> tuple[list[str | int], lis
     """The keys of `loc` without the tags that pydantic puts in for unions, and the models that may hold the last key."""
     keys: list[str | int] = []
     models, holders = [Scene], [Scene]
-    for place, part in enumerate(loc):
-        is_key = isinstance(part, int) or (isinstance(data, dict) and part in data) or place == len(loc) - 1
-        if not is_key or (keys and not isinstance(data, dict | list)):
+    for part in loc:
+        known = any(part in model.model_fields for model in models)
+        if not (known or isinstance(part, int) or (isinstance(data, dict) and part in data)):
             models = [model for model in models if part in _tags(model)] or models
             continue
         keys.append(part)
@@ -112,11 +113,15 @@ def _follow(loc: tuple[str | int, ...], data: Any) -> tuple[list[str | int], lis
                 if part in model.model_fields
                 for found in _models(model.model_fields[part].annotation)
             ]
-        try:
-            data = data[part]
-        except (KeyError, IndexError, TypeError):
-            data = None
+        data = _get(data, part)
     return keys, holders
+
+
+def _get(data: Any, key: str | int) -> Any:
+    try:
+        return data[key]
+    except (KeyError, IndexError, TypeError):
+        return None
 
 
 def _tags(model: type[BaseModel]) -> set[Any]:
@@ -134,7 +139,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 def _path(keys: list[str | int], data: Any) -> str:
     text = ""
     for key in keys:
-        data = data[key] if isinstance(data, dict | list) and (isinstance(key, int) or key in data) else None
+        data = _get(data, key)
         text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else key
         if isinstance(key, int) and isinstance(data, dict) and isinstance(data.get("name"), str):
             text += f' ("{data["name"]}")'

@@ -406,7 +406,7 @@ class _Window(Table):
 
 
 class Wind(_Window):
-    """Pressure of moving air: air_density / 2 drag area |u.n| (u.n) n on a triangle of normal n, u the air's velocity past it."""
+    """Pressure of moving air: air_density / 2 drag area |u.n| (u.n) n on a triangle of normal n, past which it goes at u."""
 
     kind: Literal["wind"] = "wind"
     velocity: Vector = Field(description="Velocity of the air, m/s.")
