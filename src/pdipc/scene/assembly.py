@@ -145,6 +145,20 @@ class Assembly:
             positions[vertices] = trajectory.apply(self.positions[vertices], time)
         return positions[self.kinematic_vertices]
 
+    def topology(self) -> dict[str, np.ndarray]:
+        """What a result needs to be read without the scene, by name: tets (t, 4), body_of_vertex (n,), scripted (n,) bool,
+        body_names and body_kinds as text.
+        """
+        scripted = np.zeros(len(self.positions), dtype=bool)
+        scripted[self.kinematic_vertices] = True
+        return {
+            "tets": self.tets,
+            "body_of_vertex": self.body_of_vertex,
+            "scripted": scripted,
+            "body_names": np.array([body.name for body in self.bodies]),
+            "body_kinds": np.array([body.kind for body in self.bodies]),
+        }
+
     def pin_targets(self, pin: AssembledPin, time: float) -> np.ndarray:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         return pin.trajectory.apply(self.positions[pin.vertices], time)

@@ -30,10 +30,13 @@ class Finding:
         return f"{self.where}: {self.found}; {self.right}"
 
 
-def check(scene: Scene | Assembly) -> list[Finding]:
-    """Everything about a scene that would be refused; empty where it can be simulated."""
+def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding]:
+    """Everything about a scene that would be refused; empty where it can be simulated.
+
+    precision: "float32" or "float64" of the simulation; None for what the scene names, float64 where it leaves it open.
+    """
     if isinstance(scene, Assembly):
-        return _check(scene, "float64")
+        return _check(scene, precision or "float64")
     findings = []
     for placed in (*scene.bodies, *scene.obstacles):
         try:
@@ -46,15 +49,15 @@ def check(scene: Scene | Assembly) -> list[Finding]:
         assembly = assemble(scene)
     except SceneError as error:
         return [Finding("scene", str(error), "put this right first")]
-    return _check(assembly, "float32" if scene.simulation.precision == "float32" else "float64")
+    return _check(assembly, precision or ("float32" if scene.simulation.precision == "float32" else "float64"))
 
 
-def refuse(scene: Scene, assembly: Assembly | None = None) -> None:
-    """Raises SceneError with all findings where `scene` (assembled, if it is at hand) cannot be simulated."""
-    findings = check(scene if assembly is None else assembly)
+def refuse(scene: Scene | Assembly, precision: str | None = None) -> None:
+    """Raises SceneError with all findings of `check` where there are any."""
+    findings = check(scene, precision)
     if findings:
-        name = f'scene "{scene.title}"' if scene.title else "the scene"
-        raise SceneError("\n  ".join([f"{name} cannot be simulated; found {len(findings)}:", *map(str, findings)]))
+        found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
+        raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
 
 
 def smallest_separation(assembly: Assembly, precision: str) -> float:
