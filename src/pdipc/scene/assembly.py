@@ -131,17 +131,22 @@ class Assembly:
         return np.concatenate([body.tets for body in self.bodies])
 
     @property
-    def kinematic_vertices(self) -> np.ndarray:
-        """(k,) int32, ascending: vertices of obstacles and those that pins hold exactly."""
+    def scripted(self) -> np.ndarray:
+        """(n,) bool: vertices of obstacles and those that pins hold exactly."""
         mask = np.zeros(len(self.positions), dtype=bool)
-        for vertices, _ in self._scripted():
+        for vertices, _ in self._scripts():
             mask[vertices] = True
-        return np.flatnonzero(mask).astype(np.int32)
+        return mask
+
+    @property
+    def kinematic_vertices(self) -> np.ndarray:
+        """(k,) int32, ascending: the numbers of the scripted vertices."""
+        return np.flatnonzero(self.scripted).astype(np.int32)
 
     def kinematic_positions(self, time: float) -> np.ndarray:
         """(k, 3) m: where `kinematic_vertices` are at `time` s."""
         positions = self.positions.copy()
-        for vertices, trajectory in self._scripted():
+        for vertices, trajectory in self._scripts():
             positions[vertices] = trajectory.apply(self.positions[vertices], time)
         return positions[self.kinematic_vertices]
 
@@ -149,12 +154,10 @@ class Assembly:
         """What a result needs to be read without the scene, by name: tets (t, 4), body_of_vertex (n,), scripted (n,) bool,
         body_names and body_kinds as text.
         """
-        scripted = np.zeros(len(self.positions), dtype=bool)
-        scripted[self.kinematic_vertices] = True
         return {
             "tets": self.tets,
             "body_of_vertex": self.body_of_vertex,
-            "scripted": scripted,
+            "scripted": self.scripted,
             "body_names": np.array([body.name for body in self.bodies]),
             "body_kinds": np.array([body.kind for body in self.bodies]),
         }
@@ -163,7 +166,7 @@ class Assembly:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         return pin.trajectory.apply(self.positions[pin.vertices], time)
 
-    def _scripted(self) -> list[tuple[np.ndarray, Trajectory]]:
+    def _scripts(self) -> list[tuple[np.ndarray, Trajectory]]:
         obstacles = [(np.arange(b.first, b.last), b.trajectory) for b in self.bodies if b.trajectory is not None]
         return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
 

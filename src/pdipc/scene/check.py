@@ -171,16 +171,10 @@ def _separation(assembly: Assembly, precision: str) -> Iterator[Finding]:
         yield Finding(", ".join(map(_label, small[:5])), found, right)
 
 
-def _scripted(assembly: Assembly) -> np.ndarray:
-    mask = np.zeros(len(assembly.positions), dtype=bool)
-    mask[assembly.kinematic_vertices] = True
-    return mask
-
-
 def _intersections(assembly: Assembly) -> tuple[set[tuple[int, int]], list[Finding]]:
     """Pairs of bodies that intersect, i <= j, and what there is to say."""
     triangles = assembly.triangles
-    pairs = find_intersections(assembly.positions, triangles, _scripted(assembly))
+    pairs = find_intersections(assembly.positions, triangles, assembly.scripted)
     owners = np.sort(assembly.body_of_vertex[triangles[pairs][:, :, 0]], axis=1)
     findings, touching = [], set()
     for i, j in np.unique(owners, axis=0):

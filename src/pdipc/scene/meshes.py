@@ -188,7 +188,8 @@ def _read_usd(path: Path):
         from pxr import Usd
     except ImportError as error:
         raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
-    for prim in Usd.Stage.Open(str(path)).Traverse():
+    stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
+    for prim in stage.Traverse():
         if prim.GetTypeName() != "Mesh":
             continue
         points = np.array(prim.GetAttribute("points").Get(), dtype=np.float64)
