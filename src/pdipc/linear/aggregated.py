@@ -231,17 +231,20 @@ class AJacobi(Solver):
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
         self._group_kernels = group_kernels(self.real, self.capacity)
 
-    def update(self) -> None:
-        """Launches the computation of the A-coefficients for the present diagonal (Eq. 14)."""
+    def prepare(self, contact: Contact | None) -> None:
+        """Launches the inverse of the diagonal, and with it the A-coefficients (Eq. 14)."""
+        if contact is not None and (contact.diagonal is not None or contact.apply is not None):
+            raise ValueError('a-jacobi takes scalar contacts only (contact = "paper"); "matrix-powers" takes 3x3 blocks')
+        super().prepare(contact)
         inputs = [self.inverse, self.system.count, *self._paths, self.coefficients.values]
         self.device.launch(self._kernels.update, len(self.products.rows), inputs, grain=16)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
-        if contact is not None and (contact.diagonal is not None or contact.apply is not None):
-            raise ValueError('a-jacobi takes scalar contacts only (contact = "paper"); "matrix-powers" takes 3x3 blocks')
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         sums, status_kernels = self.sums, jacobi.kernels(self.real)
-        self.invert_diagonal(contact)
-        self.update()
+        if not prepared:
+            self.prepare(contact)
         self._form_constant(x, b)
         self.copy(self._x, x)
         self.copy(self._before, x)

@@ -25,11 +25,14 @@ class Direct(Solver):
         self._inverse = factorize(self._matrix) if self._free.size else np.copy
         self._p, self._y = self.zeros(self.real.vec3), self.zeros(self.real.vec3)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         free, n = self._free, self.system.count
         start = x.numpy().astype(np.float64)
         right = b.numpy()[free].astype(np.float64)
-        self.invert_diagonal(contact)
+        if not prepared:
+            self.prepare(contact)
 
         def hessian(p: np.ndarray) -> np.ndarray:
             """Contacts' part of K p at the free vertices."""

@@ -59,12 +59,15 @@ class Sor(Solver):
         self._x, self._w = self.zeros(self.real.vec3), self.zeros(self.real.vec3)
         self._kernels = kernels(self.real)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         apply = contact.apply if contact is not None else None
         status_kernels = jacobi.kernels(self.real)
         matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
         status = [self.first, self.left, self.iterations, self.residual, self.condition]
-        self.invert_diagonal(contact)
+        if not prepared:
+            self.prepare(contact)
         self.copy(self._x, x)
 
         def couple() -> None:

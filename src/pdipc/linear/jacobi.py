@@ -65,9 +65,12 @@ class Jacobi(Solver):
         matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
         self.sums.launch(self._kernels.sweep, [*matrix, *self.weights, step, coupled, self._w, source, target, self.partial])
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         apply = contact.apply if contact is not None else None
-        self.invert_diagonal(contact)
+        if not prepared:
+            self.prepare(contact)
         self.copy(self._x, x)
         self.copy(self._before, x)
         if apply:

@@ -55,22 +55,24 @@ class Pcg(Solver):
         self.steps = wp.zeros((max_iterations, 2), dtype=scalar, device=self.device.warp)
         self._kernels = kernels(self.real)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         apply = contact.apply if contact is not None else None
         coupled = int(apply is not None)
         k, sums = self._kernels, self.sums
         matrix = [*self.system.rows.arguments, self.total]
-        preconditioner = [self.inverse, self.inverse_block]
-        self.invert_diagonal(contact)
+        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        if not prepared:
+            self.prepare(contact)
         if apply:
             self.clear(self._w)
             apply(x, self._w)
         self.copy(self._p, x)
-        sums.launch(
-            k.start, [*matrix, *preconditioner, b, self._p, coupled, self._w, self._s, self._r, self._u, self.partial]
-        )
+        vectors = [self._w, self._s, self._r, self._u]
+        sums.launch(k.start, [*matrix, *self.preconditioner, b, self._p, coupled, *vectors, self.partial])
         self.clear(self._p)
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        self._correct_start()
         sums.conclude(k.begin, [self.partial, sums.slots, self._numbers, reference, *self.limits, *status])
 
         def iterate() -> None:
@@ -78,19 +80,25 @@ class Pcg(Solver):
                 apply(self._u, self._w)
             sums.launch(k.multiply, [*matrix, self._u, coupled, self._w, self.partial])
             sums.conclude(k.find_alpha, [self.partial, sums.slots, self._numbers, self.left])
-            vectors = [self._w, self._p, self._s, x, self._r, self._u]
-            sums.launch(k.update, [*preconditioner, self._numbers, coupled, *vectors, self.partial])
+            self._update(x, coupled)
             sums.conclude(k.find_beta, [self.partial, sums.slots, self._numbers, self.steps, *self.limits, *status])
 
         self.device.loop(self.condition, iterate)
 
+    def _correct_start(self) -> None:
+        """For a preconditioner that is more than the block diagonal: launches u and the partial sums of gamma anew."""
+
+    def _update(self, x: wp.array, coupled: int) -> None:
+        """Launches one step of all vectors and the partial sums of gamma."""
+        vectors = [self._w, self._p, self._s, x, self._r, self._u]
+        inputs = [*self.preconditioner, self._numbers, coupled, *vectors, self.partial]
+        self.sums.launch(self._kernels.update, inputs)
+
 
 @functools.cache
-def kernels(real: Real) -> SimpleNamespace:
-    """The kernels of one iteration."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    module = real.module(__name__)
-    f = shared.functions(real)
+def functions(real: Real) -> SimpleNamespace:
+    """The step of all vectors that needs no preconditioner, for the vertices low to high - 1."""
+    scalar, vec3 = real.scalar, real.vec3
 
     @wp.func_native(_ADVANCE.replace("SCALAR", f"wp::{real.name}"))
     def advance(
@@ -105,6 +113,17 @@ def kernels(real: Real) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
     ): ...
+
+    return SimpleNamespace(advance=advance)
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    """The kernels of one iteration."""
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    module = real.module(__name__)
+    f = shared.functions(real)
+    advance = functions(real).advance
 
     @wp.kernel(module=module)
     def start(

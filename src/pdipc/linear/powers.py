@@ -144,11 +144,14 @@ class MatrixPowers(jacobi.Chebyshev):
         self._group_arrays += [integers(offsets), integers(columns), wp.array(data, device=self.device.warp)]
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         if contact is not None and contact.apply is not None:
-            super().solve(x, b, contact, reference)
+            super().solve(x, b, contact, reference, prepared)
             return
-        self.invert_diagonal(contact)
+        if not prepared:
+            self.prepare(contact)
         for buffer in (self._x, self._before, self._x2, self._before2):
             self.copy(buffer, x)
         status = [self.first, self.left, self.iterations, self.residual, self.condition]

@@ -49,14 +49,25 @@ class Solver:
         self.left, self.condition = self.zeros(wp.int32, 1), self.zeros(wp.int32, 1)
         self.partial = self.zeros(scalar, self.sums.slots)
         self.total, self.inverse, self.inverse_block = self.zeros(scalar), self.zeros(scalar), self.zeros(self.real.mat33)
+        self.preconditioner = [self.inverse, self.inverse_block]
         self._shared = kernels.kernels(self.real)
 
-    def solve(self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None) -> None:
+    def prepare(self, contact: Contact | None) -> None:
+        """Launches what depends on A and the contacts alone, not on x and b."""
+        scalar = contact.scalar if contact is not None else None
+        block = contact.diagonal if contact is not None else None
+        inputs = [self.system.diagonal, scalar, block, self.total, self.inverse, self.inverse_block]
+        self.device.launch(self._shared.invert_diagonal, self.system.count, inputs, grain=8)
+
+    def solve(
+        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+    ) -> None:
         """Launches the solution of K x = b.
 
         x: (n,) vec3, m; the start on entry, the solution on return; entries that are not free stay as they are.
         b: (n,) vec3, N.
         reference: (1,) on the device, the residual norm that the tolerance refers to, instead of the one at the start.
+        prepared: whether `prepare` was called since the contacts last changed; otherwise solve does that itself.
         """
         raise NotImplementedError
 
@@ -71,10 +82,3 @@ class Solver:
     def copy(self, destination: wp.array, source: wp.array) -> None:
         """Launches destination = source over the vertices."""
         self.device.launch(self._shared.copy, self.system.count, [source, destination])
-
-    def invert_diagonal(self, contact: Contact | None) -> None:
-        """Launches the computation of `total`, `inverse` and `inverse_block` from A and the contacts."""
-        scalar = contact.scalar if contact is not None else None
-        block = contact.diagonal if contact is not None else None
-        inputs = [self.system.diagonal, scalar, block, self.total, self.inverse, self.inverse_block]
-        self.device.launch(self._shared.invert_diagonal, self.system.count, inputs, grain=8)

@@ -3,6 +3,7 @@
 from typing import Any
 
 from pdipc.linear.aggregated import AJacobi
+from pdipc.linear.coarse import TwoLevel
 from pdipc.linear.direct import Direct
 from pdipc.linear.gauss_seidel import GaussSeidel, Sor
 from pdipc.linear.jacobi import Chebyshev, Jacobi
@@ -13,6 +14,7 @@ from pdipc.linear.system import System
 
 SOLVERS: dict[str, type[Solver]] = {
     "pcg": Pcg,
+    "two-level": TwoLevel,
     "jacobi": Jacobi,
     "chebyshev": Chebyshev,
     "a-jacobi": AJacobi,
