@@ -180,6 +180,16 @@ class Device:
         if self._recording is not None:
             self._meet()
 
+    def launch_scatter(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
+        """Runs a kernel over a list that counts with integer atomics: in one thread on the CPU, where those are not atomic."""
+        if self.is_cuda:
+            self.launch_list(kernel, capacity, inputs)
+        else:
+            if self._recording is None or self._recording == 0:
+                wp.launch(kernel, dim=1, inputs=[_span(0, 1, CPU_BLOCK), *inputs], device=self.warp)
+            if self._recording is not None:
+                self._meet()
+
     def copy(self, destination: wp.array, source: wp.array) -> None:
         """Copies an array inside or outside of a recording."""
         if self._recording is None or self._recording == 0:

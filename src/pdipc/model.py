@@ -1,0 +1,212 @@
+"""The model: what stays constant during a simulation, assembled once from a scene; and the state that a step changes."""
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from pdipc import constraints
+from pdipc.contact import broad_phase, surface
+from pdipc.forces import ExternalForces
+from pdipc.linear.solver import Solver
+from pdipc.linear.solvers import make_solver
+from pdipc.linear.system import System
+from pdipc.parallel import Device
+from pdipc.precision import Real, real
+from pdipc.scene.assembly import Assembly, assemble
+from pdipc.scene.check import refuse
+from pdipc.scene.schema import Scene
+
+DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
+
+INNER_TOLERANCE = 0.05
+
+
+@dataclass
+class State:
+    """Positions, velocities and accelerations of all n vertices at one time.
+
+    positions: (n,) vec3, m. velocities: (n,) vec3, m/s. accelerations: (n,) vec3, m/s^2. time: s. step: steps done.
+    """
+
+    positions: wp.array
+    velocities: wp.array
+    accelerations: wp.array
+    time: float = 0.0
+    step: int = 0
+
+    def copy(self) -> "State":
+        """An independent copy."""
+        return replace(
+            self,
+            positions=wp.clone(self.positions),
+            velocities=wp.clone(self.velocities),
+            accelerations=wp.clone(self.accelerations),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
+        return {
+            "positions": self.positions.numpy().copy(),
+            "velocities": self.velocities.numpy().copy(),
+            "accelerations": self.accelerations.numpy().copy(),
+            "time": np.float64(self.time),
+            "step": np.int64(self.step),
+        }
+
+
+@dataclass
+class Settings:
+    """How a step is solved: the scene's `simulation` and `contact` tables in metres and seconds."""
+
+    time_step: float  # of one sub-step
+    outer_tolerance: float  # m: a step has converged when an outer iteration's untruncated motion is smaller
+    max_outer: int
+    inner_iterations: int
+    inner_tolerance: float  # the inner loop ends once an iteration moves by less than this part of the first
+    activation_distance: float
+    slip_threshold: float  # m
+    per_vertex_truncation: bool
+    damping: float  # 1/s
+    budget_ms: float | None  # of one sub-step
+    margin: float  # m: how far a vertex may leave its swept box before candidates are listed again
+
+
+@dataclass
+class Model:
+    """What stays constant: topology, masses, constraints, the global matrix and its solver, the contact surface.
+
+    Arrays over all n vertices, simulated and kinematic: mass (n,) kg, 0 where kinematic; free (n,) 1 or 0;
+    half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness.
+    rigid: vertex ranges of the moving obstacles. triangles: (m, 3) int32, all surfaces.
+    """
+
+    scene: Scene
+    assembly: Assembly
+    settings: Settings
+    device: Device
+    real: Real
+    substeps: int
+    mass: wp.array
+    free: wp.array
+    half_separation: wp.array
+    friction: wp.array
+    kappa: wp.array
+    projector: constraints.Projector
+    solver: Solver
+    surface: surface.Surface
+    broad_phase: broad_phase.BroadPhase
+    external: ExternalForces
+    rigid: list[tuple[int, int]]
+    triangles: np.ndarray
+
+    @property
+    def vertex_count(self) -> int:
+        """Simulated and kinematic vertices together."""
+        return len(self.mass)
+
+    def initial_state(self) -> State:
+        """The scene's start: time 0, with its initial velocities."""
+        a = self.assembly
+        zero = np.zeros_like(a.positions)
+        return self.state_from({"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "time": 0.0})
+
+    def state_from(self, arrays: dict[str, np.ndarray]) -> State:
+        """A state from NumPy arrays such as `State.arrays()` gives."""
+
+        def upload(name: str) -> wp.array:
+            return wp.array(np.asarray(arrays[name]), dtype=self.real.vec3, device=self.device.warp)
+
+        vectors = [upload(name) for name in ("positions", "velocities", "accelerations")]
+        return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
+
+    @functools.cached_property
+    def moves(self) -> bool:
+        """Whether any kinematic vertex follows a motion."""
+        a = self.assembly
+        scripted = [body.trajectory for body in a.bodies if body.trajectory] + [pin.trajectory for pin in a.pins]
+        return any(not trajectory.is_static for trajectory in scripted)
+
+    def kinematic_targets(self, time: float) -> np.ndarray:
+        """(n, 3) m: where the kinematic vertices are at `time`; the start for all others."""
+        targets = self.assembly.positions.copy()
+        targets[self.assembly.kinematic_vertices] = self.assembly.kinematic_positions(time)
+        return targets
+
+
+def build(scene: Scene, device: str | None = None) -> Model:
+    """Assembles a scene on a device: "cpu", "cuda:0", or None for the scene's choice, else CUDA where there is one.
+
+    Raises SceneError for what `pdipc.check_scene` finds, before anything is launched.
+    """
+    assembly = assemble(scene)
+    refuse(assembly)
+    sim = scene.simulation
+    place = Device(device or sim.device)
+    number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
+    h = sim.time_step / sim.substeps
+    n = len(assembly.positions)
+    free = np.ones(n, dtype=bool)
+    free[assembly.kinematic_vertices] = False
+    sets, mass = elasticity(assembly)
+    mass = np.where(free, mass, 0.0)
+    stiffness = constraints.stiffness_matrix(n, sets)
+    matrix = stiffness + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
+    options = {"order": sim.solver_order} if sim.linear_solver == "a-jacobi" else {}
+    system = System(place, number, matrix, free)
+    solver = make_solver(
+        sim.linear_solver, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options
+    )
+
+    per_vertex = {"friction": np.zeros(n), "half_separation": np.zeros(n), "kappa": np.zeros(n)}
+    for body in assembly.bodies:
+        own = slice(body.first, body.last)
+        per_vertex["friction"][own] = body.friction
+        per_vertex["half_separation"][own] = body.half_separation
+        if not body.kinematic:
+            per_vertex["kappa"][own] = scene.contact.stiffness_scale * mass[own].mean() / (h * h)
+    per_vertex["kappa"][~free] = 0.0
+
+    def upload(values: np.ndarray) -> wp.array:
+        return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
+
+    skin = surface.build(place, assembly.triangles, n, assembly.body_of_vertex, ~free)
+    return Model(
+        scene=scene,
+        assembly=assembly,
+        settings=Settings(
+            time_step=h,
+            outer_tolerance=sim.outer_tolerance * assembly.scene_size,
+            max_outer=sim.max_outer,
+            inner_iterations=sim.inner_iterations,
+            inner_tolerance=INNER_TOLERANCE,
+            activation_distance=assembly.activation_distance,
+            slip_threshold=scene.contact.friction_velocity * h,
+            per_vertex_truncation=scene.contact.truncation == "per_vertex",
+            damping=sim.damping,
+            budget_ms=None if sim.budget_ms is None else sim.budget_ms / sim.substeps,
+            margin=0.5 * assembly.activation_distance,
+        ),
+        device=place,
+        real=number,
+        substeps=sim.substeps,
+        mass=upload(mass),
+        free=upload(free),
+        half_separation=upload(per_vertex["half_separation"]),
+        friction=upload(per_vertex["friction"]),
+        kappa=upload(per_vertex["kappa"]),
+        projector=constraints.Projector(place, number, n, sets),
+        solver=solver,
+        surface=skin,
+        broad_phase=broad_phase.BroadPhase(place, number, skin, assembly.rest_positions, scene.contact.broad_phase),
+        external=ExternalForces(assembly, np.array(sim.gravity), mass),
+        rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
+        triangles=assembly.triangles,
+    )
+
+
+def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+    """The projective constraints of all bodies (Section 3), and the lumped masses (n,) kg."""
+    raise NotImplementedError

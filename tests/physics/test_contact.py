@@ -1,0 +1,62 @@
+"""Contact against what mechanics says: momentum, friction, slopes."""
+
+import numpy as np
+import pytest
+from scenes import floor, scene, solid, watched
+
+G = 9.81
+
+
+def test_free_collision_conserves_linear_momentum():
+    a = solid("a", (0.2, 0.2, 0.2), (2, 2, 2), at=(-0.15, 0, 0), velocity=(2, 0, 0), density=500)
+    b = solid("b", (0.2, 0.2, 0.2), (2, 2, 2), at=(0.15, 0.03, 0.02), velocity=(-1, 0, 0), rotation=(10, 20, 30))
+    simulation = watched(scene([a, b], gravity=(0, 0, 0), time_step=0.01, max_outer=100))
+    mass = simulation.model.mass_numpy[:, None]
+
+    def momentum():
+        return (mass * simulation.state.velocities.numpy()).sum(axis=0)
+
+    before, barriers = momentum(), 0
+    for _ in range(30):
+        barriers += simulation.step().barriers
+    assert barriers > 0
+    scale = (mass * np.abs(simulation.model.assembly.velocities)).sum()
+    assert np.abs(momentum() - before).max() < 1e-5 * scale
+
+
+def slide(angle, friction, seconds, h=0.01):
+    """Distance that a stiff block slides down a slope of `angle` degrees from rest, and the analytic g t^2 / 2."""
+    slope = np.radians(angle)
+    gap, size = 1.5e-3, 0.2
+    normal = np.array([np.sin(slope), np.cos(slope), 0])  # of a plane turned by -angle about z
+    down = np.array([np.cos(slope), -np.sin(slope), 0])
+    at = tuple((size / 4 + gap) * normal)
+    block = solid("block", (size, size / 2, size), (3, 2, 3), at=at, rotation=(0, 0, -angle), young=1e6, friction=friction)
+    ground = floor(20.0, rotation=(0, 0, -angle), friction=friction)
+    contact = {"activation_distance": 2e-3}
+    simulation = watched(scene([block], [ground], contact=contact, time_step=h, max_outer=200))
+    mass = simulation.model.mass_numpy[:, None]
+    speeds = []
+    for _ in range(round(seconds / h)):
+        simulation.step()
+        speeds.append(((mass * simulation.state.velocities.numpy()).sum(axis=0) / mass.sum()) @ down)
+    return np.array(speeds)
+
+
+def acceleration(speeds, h=0.01):
+    """Slope of the speed over the second half, when the block has settled."""
+    half = len(speeds) // 2
+    return np.polyfit(h * np.arange(half, len(speeds)), speeds[half:], 1)[0]
+
+
+def test_frictionless_slope():
+    assert acceleration(slide(20.0, 0.0, 0.6)) == pytest.approx(G * np.sin(np.radians(20.0)), rel=0.02)
+
+
+def test_sliding_with_friction():
+    angle, mu = np.radians(30.0), 0.3
+    assert acceleration(slide(30.0, 0.3, 0.6)) == pytest.approx(G * (np.sin(angle) - mu * np.cos(angle)), rel=0.02)
+
+
+def test_sticks_below_the_friction_angle():
+    assert abs(slide(15.0, 0.4, 0.5)[-1]) < 2e-3
