@@ -101,7 +101,7 @@ def kernels(real: Real) -> SimpleNamespace:
         done: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
-        """Solves for theta and decides whether the loop goes on. norms: |f|^2 of the last increment; largest |f| of the first."""
+        """Solves for theta and decides whether to go on. norms: |f|^2 of the last increment; largest |f| of the first."""
         total = sums()
         largest = wp.float64(0.0)
         for b in range(blocks):
@@ -137,7 +137,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     if j < held:
                         shift += a[j, j]
                 shift *= wp.float64(REGULARIZATION)
-                l = square()
+                low = square()
                 y = small()
                 for i in range(memory):
                     if i < held:
@@ -146,23 +146,23 @@ def kernels(real: Real) -> SimpleNamespace:
                             if i == j:
                                 s += shift
                             for k in range(j):
-                                s -= l[i, k] * l[j, k]
+                                s -= low[i, k] * low[j, k]
                             if i == j:
-                                l[i, i] = wp.sqrt(wp.max(s, shift + wp.float64(1.0e-300)))
+                                low[i, i] = wp.sqrt(wp.max(s, shift + wp.float64(1.0e-300)))
                             else:
-                                l[i, j] = s / l[j, j]
+                                low[i, j] = s / low[j, j]
                         s = total[memory + i]
                         for k in range(i):
-                            s -= l[i, k] * y[k]
-                        y[i] = s / l[i, i]
+                            s -= low[i, k] * y[k]
+                        y[i] = s / low[i, i]
                 for back in range(memory):
                     i = memory - 1 - back
                     if i < held:
                         s = y[i]
                         for k in range(i + 1, memory):
                             if k < held:
-                                s -= l[k, i] * theta[k]
-                        theta[i] = s / l[i, i]
+                                s -= low[k, i] * theta[k]
+                        theta[i] = s / low[i, i]
         norms[0] = squared
         known[0] = seen + 1
         theta_out[0] = theta

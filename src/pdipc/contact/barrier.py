@@ -44,7 +44,7 @@ def functions(real: Real) -> SimpleNamespace:
 
     @wp.func
     def extended_gradient(d: scalar, d_floor: scalar, d_hat: scalar) -> scalar:
-        """b'(d), continued below d_floor by its tangent: the iterate may be past contact until it is truncated (Section 4.3)."""
+        """b'(d), continued below d_floor by its tangent: the iterate may be past contact until it is truncated."""
         at = wp.max(d, d_floor)
         return barrier_gradient(at, d_hat) + barrier_hessian(at, d_hat) * (d - at)
 

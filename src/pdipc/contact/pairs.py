@@ -66,7 +66,7 @@ def kernels(real: Real) -> SimpleNamespace:
             active_out: wp.array(dtype=wp.int32),
         ):
             b = first + wp.tid()
-            active = 0
+            active = int(0)
             for k in range(b * block, wp.min((b + 1) * block, count)):
                 gap = gap_of(x, quads[k], limits[k])
                 gaps_out[k] = gap
@@ -183,7 +183,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def sort_incident(first: int, ends: wp.array(dtype=wp.int32), entries: wp.array(dtype=wp.int32)):
         """Puts a vertex's pairs in order, so that its sums do not depend on how threads raced to fill the list."""
         v = first + wp.tid()
-        low = 0
+        low = int(0)
         if v > 0:
             low = ends[v - 1]
         for i in range(low + 1, ends[v]):
@@ -247,7 +247,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Adds the contact forces to the right-hand side and makes the block diagonal that dominates the contact Hessian."""
         v = first + wp.tid()
-        low = 0
+        low = int(0)
         if v > 0:
             low = ends[v - 1]
         total = vec3()
@@ -298,7 +298,7 @@ def kernels(real: Real) -> SimpleNamespace:
         y: wp.array(dtype=vec3),
     ):
         v = first + wp.tid()
-        low = 0
+        low = int(0)
         if v > 0:
             low = ends[v - 1]
         if ends[v] > low:

@@ -51,7 +51,7 @@ def kernels(real: Real) -> SimpleNamespace:
             hits_out: wp.array(dtype=wp.int32),
         ):
             b = first + wp.tid()
-            hits = 0
+            hits = int(0)
             for k in range(b * block, wp.min((b + 1) * block, count)):
                 q = quads[k]
                 time = unit
