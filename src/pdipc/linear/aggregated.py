@@ -279,7 +279,7 @@ class AJacobi(Solver):
 
     def _sweep(self, source: wp.array, target: wp.array, step: int) -> None:
         entries = self.coefficients.arguments
-        state = [self.total, self._constant, self._factors, self.left, self.max_iterations, step, source, target]
+        state = [self.total, self._constant, self._factors, self.left, self.limits[1], step, source, target]
         if self.grouped:
             inputs = [*self._group_arrays, entries[0], entries[2], *state, self._group_partial]
             self.sums.launch_groups(self._group_kernels.grouped_sweep, self.groups, inputs)

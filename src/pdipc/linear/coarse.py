@@ -107,33 +107,26 @@ class TwoLevel(pcg.Pcg):
         self._z = self.zeros(wp.vec4d, max(1, self.groups))
         self._coarse = kernels(real)
 
-    @property
-    def _group_arrays(self) -> list[wp.array]:
-        return [self._member_starts, self._members]
-
     def prepare(self, contact: Contact | None) -> None:
         super().prepare(contact)
         scalar = contact.scalar if contact is not None else None
         block = contact.diagonal if contact is not None else None
-        inputs = [*self._group_arrays, scalar, block, self._added]
+        inputs = [self._member_starts, self._members, scalar, block, self._added]
         self.device.launch(self._coarse.add_contacts, self.groups, inputs, grain=GROUP)
         inputs = [self.groups, self._profile_starts, self._entries, self._added, self._factor]
         self.device.launch_serial(self._coarse.factorize, inputs)
 
-    def _correct_start(self) -> None:
-        self.device.launch(self._coarse.restrict, self.groups, [*self._group_arrays, self._r, self._z], grain=GROUP)
-        self._correct()
-
-    def _update(self, x: wp.array, coupled: int) -> None:
-        vectors = [self._w, self._u, self._p, self._s, x, self._r]
-        inputs = [*self._group_arrays, self._numbers, coupled, *vectors, self._z]
-        self.device.launch(self._coarse.update, self.groups, inputs, grain=GROUP)
-        self._correct()
-
-    def _correct(self) -> None:
+    def _precondition(self) -> None:
+        inputs = [self._member_starts, self._members, self._r, self._z]
+        self.device.launch(self._coarse.restrict, self.groups, inputs, grain=GROUP)
         self.device.launch_serial(self._coarse.solve, [self.groups, self._profile_starts, self._factor, self._z])
         inputs = [*self.preconditioner, self._label, self._z, self._r, self._u, self.partial]
         self.sums.launch(self._coarse.correct, inputs)
+
+    def _update(self, x: wp.array, coupled: int) -> None:
+        vectors = [self._w, self._u, self._p, self._s, x, self._r]
+        self.sums.launch(self._coarse.advance, [self._numbers, coupled, *vectors])
+        self._precondition()
 
 
 def _profile(matrix: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +147,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
     f = shared.functions(real)
-    advance = pcg.functions(real).advance
+    advance_vertices = pcg.functions(real).advance
     alpha_slot, beta_slot = pcg.ALPHA, pcg.BETA
 
     @wp.func_native(_FACTORIZE)
@@ -228,10 +221,10 @@ def kernels(real: Real) -> SimpleNamespace:
         z_out[g] = wp.vec4d(wp.float64(total[0]), wp.float64(total[1]), wp.float64(total[2]), wp.float64(0.0))
 
     @wp.kernel(module=module)
-    def update(
+    def advance(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
+        share: int,
+        count: int,
         numbers: wp.array(dtype=scalar),
         coupled: int,
         w: wp.array(dtype=vec3),
@@ -240,20 +233,14 @@ def kernels(real: Real) -> SimpleNamespace:
         s: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
-        z_out: wp.array(dtype=wp.vec4d),
     ):
-        """All vectors one step on (as in pcg.py), and z = Z^T r; w is left zero where contacts will add to it."""
-        g = first + wp.tid()
-        alpha = numbers[alpha_slot]
-        beta = numbers[beta_slot]
-        total = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        for k in range(starts[g], starts[g + 1]):
-            i = members[k]
-            advance(i, i + 1, alpha, beta, w, u, p, s, x, r)
-            total += r[i]
-            if coupled != 0:
+        """All vectors one step on (as in pcg.py); w is left zero where contacts will add to it."""
+        low = (first + wp.tid()) * share
+        high = wp.min(low + share, count)
+        advance_vertices(low, high, numbers[alpha_slot], numbers[beta_slot], w, u, p, s, x, r)
+        if coupled != 0:
+            for i in range(low, high):
                 w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        z_out[g] = wp.vec4d(wp.float64(total[0]), wp.float64(total[1]), wp.float64(total[2]), wp.float64(0.0))
 
     @wp.kernel(module=module)
     def correct(

@@ -58,7 +58,7 @@ class Jacobi(Solver):
     @property
     def weights(self) -> list[Any]:
         """w, the factors omega, and what tells the number of the sweep."""
-        return [self.real.scalar(self.weight), self._factors, self.left, self.max_iterations]
+        return [self.real.scalar(self.weight), self._factors, self.left, self.limits[1]]
 
     def sweep(self, source: wp.array, target: wp.array, step: int, b: wp.array, coupled: int = 0) -> None:
         """Launches the sweep number `step` of the current group of sweeps, or with -1 only the residual of `source`."""

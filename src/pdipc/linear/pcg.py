@@ -72,7 +72,7 @@ class Pcg(Solver):
         vectors = [self._w, self._s, self._r, self._u]
         sums.launch(k.start, [*matrix, *self.preconditioner, b, self._p, coupled, *vectors, self.partial])
         self.clear(self._p)
-        self._correct_start()
+        self._precondition()
         sums.conclude(k.begin, [self.partial, sums.slots, self._numbers, reference, *self.limits, *status])
 
         def iterate() -> None:
@@ -85,8 +85,8 @@ class Pcg(Solver):
 
         self.device.loop(self.condition, iterate)
 
-    def _correct_start(self) -> None:
-        """For a preconditioner that is more than the block diagonal: launches u and the partial sums of gamma anew."""
+    def _precondition(self) -> None:
+        """For a preconditioner that is more than the block diagonal: launches u = M^-1 r and the partial sums of gamma."""
 
     def _update(self, x: wp.array, coupled: int) -> None:
         """Launches one step of all vectors and the partial sums of gamma."""
