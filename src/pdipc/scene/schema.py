@@ -67,7 +67,9 @@ class Simulation(Table):
         50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
     )
     inner_iterations: int = Field(5, ge=1, description="Local-global iterations in an outer iteration.")
-    linear_solver: str = Field("pcg", description="Solver of the global step; see `pdipc.linear.solvers`.")
+    linear_solver: Literal[
+        "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
+    ] = Field("pcg", description="Solver of the global step.")
     linear_iterations: int = Field(10, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         1e-4, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
