@@ -1,6 +1,8 @@
 """Meshes: reading them from files, and the few facts about them that the rest of the package needs."""
 
+import contextlib
 import importlib.util
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -215,5 +217,6 @@ def tetrahedralize(mesh: Mesh, where: str) -> Mesh:
         raise SceneError(
             f'{where}: "tetrahedralize" needs the extra: pip install "pdipc[tetrahedralize]"; or give a tetrahedral mesh'
         ) from error
-    vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it works
+        vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]
     return from_arrays(vertices, tets, None, f"{where}, tetrahedralized")
