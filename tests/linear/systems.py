@@ -114,3 +114,18 @@ def _assemble(count: int, elements: np.ndarray, blocks: np.ndarray, diagonal: np
     matrix = sp.coo_matrix((blocks.ravel(), (rows, columns)), shape=(count, count)).tocsr()
     matrix = (matrix + matrix.T) / 2.0
     return sp.csr_matrix(matrix + sp.diags_array(diagonal))
+
+
+def meshes() -> dict[str, tuple[np.ndarray, sp.csr_matrix]]:
+    """Small systems of every kind: vertices and matrix."""
+    found = {}
+    x, tets = tet_grid(6)
+    found["regular tets"] = (x, tet_matrix(x, tets))
+    x, tets = tet_delaunay(343)
+    found["jittered Delaunay"] = (x, tet_matrix(x, tets))
+    x, tets = tet_delaunay(343, least_quality=1e-4)
+    found["slivers"] = (x, tet_matrix(x, tets))
+    x, triangles = cloth_grid(18)
+    found["soft cloth"] = (x, cloth_matrix(x, triangles, young=1e4))
+    found["stiff cloth"] = (x, cloth_matrix(x, triangles, young=1e6))
+    return found

@@ -159,6 +159,8 @@ class AJacobi(Solver):
             raise ValueError(f"order is {order}; it must be at least 1")
         self.order, self.grouped = order, self.device.is_cuda if grouped is None else grouped
         inner_weight, rho = jacobi.weight_and_radius(system, weight)
+        if rho >= 1.0 and (accelerated or polynomial != "power"):
+            raise ValueError(f"weight {inner_weight:g} makes Jacobi's iteration diverge (spectral radius {rho:.3f})")
         coefficients, low, high = aggregate(polynomial, order, inner_weight, rho)
         # A second weight centres the interval of p(G) before Chebyshev is applied to it.
         outer = 2.0 / (2.0 - low - high) if accelerated else 1.0
@@ -240,7 +242,12 @@ class AJacobi(Solver):
         self.device.launch(self._kernels.update, len(self.products.rows), inputs, grain=16)
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         sums, status_kernels = self.sums, jacobi.kernels(self.real)
         if not prepared:

@@ -26,7 +26,12 @@ class Direct(Solver):
         self._p, self._y = self.zeros(self.real.vec3), self.zeros(self.real.vec3)
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         free, n = self._free, self.system.count
         start = x.numpy().astype(np.float64)

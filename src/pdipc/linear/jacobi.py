@@ -49,6 +49,8 @@ class Jacobi(Solver):
     def __init__(self, system: System, tolerance: float, max_iterations: int, weight: float | None = None):
         super().__init__(system, tolerance, max_iterations)
         self.weight, self.rho = weight_and_radius(system, weight)
+        if self.accelerated and self.rho >= 1.0:
+            raise ValueError(f"weight {self.weight:g} makes Jacobi's iteration diverge (spectral radius {self.rho:.3f})")
         sweeps = max_iterations + self.chunk
         factors = chebyshev_factors(self.rho, sweeps) if self.accelerated else np.ones(sweeps)
         self._factors = wp.array(factors.astype(self.real.numpy), device=self.device.warp)
@@ -66,7 +68,12 @@ class Jacobi(Solver):
         self.sums.launch(self._kernels.sweep, [*matrix, *self.weights, step, coupled, self._w, source, target, self.partial])
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         apply = contact.apply if contact is not None else None
         if not prepared:

@@ -56,7 +56,12 @@ class Pcg(Solver):
         self._kernels = kernels(self.real)
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         apply = contact.apply if contact is not None else None
         coupled = int(apply is not None)

@@ -19,7 +19,7 @@ from pdipc.linear.solver import Contact
 from pdipc.linear.system import System
 from pdipc.precision import Real
 
-SHARED_BYTES = 48 * 1024  # fast memory of a block of threads on CUDA
+SHARED_BYTES = 40 * 1024  # fast memory of a block of threads on CUDA, with some left for sums
 CPU_GROUP = 512  # vertices of a group on the CPU
 
 _SWEEPS = """
@@ -108,7 +108,7 @@ class MatrixPowers(jacobi.Chebyshev):
         matrix = sp.csr_matrix(sp.diags_array(system.free.astype(float)) @ system.matrix)
         matrix.setdiag(0.0)
         matrix.eliminate_zeros()
-        fits = SHARED_BYTES // (6 * self.real.numpy.itemsize) - 1 if self.device.is_cuda else None
+        fits = capacity_on_cuda(self.real) if self.device.is_cuda else None
         size = group or (shared.BLOCK if self.device.is_cuda else CPU_GROUP)
         while True:
             label = partition.groups(system.matrix, system.free, size)
@@ -145,7 +145,12 @@ class MatrixPowers(jacobi.Chebyshev):
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         if contact is not None and contact.apply is not None:
             super().solve(x, b, contact, reference, prepared)
@@ -167,12 +172,15 @@ class MatrixPowers(jacobi.Chebyshev):
         def iterate() -> None:
             run(0, (self._x, self._before), (self._x2, self._before2))
             run(self.order, (self._x2, self._before2), (self._x, self._before))
-            self.sums.conclude(
-                self._kernels.check, [self._group_partial, self.groups, self.chunk, 2, *self.limits, *status]
-            )
+            self.sums.conclude(self._kernels.check, [self._group_partial, self.groups, self.chunk, 2, *self.limits, *status])
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
+
+
+def capacity_on_cuda(real: Real) -> int:
+    """Vertices whose last two positions fit into a block's fast memory."""
+    return SHARED_BYTES // (6 * real.numpy.itemsize) - 1
 
 
 @functools.cache

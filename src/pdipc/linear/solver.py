@@ -60,7 +60,12 @@ class Solver:
         self.device.launch(self._shared.invert_diagonal, self.system.count, inputs, grain=8)
 
     def solve(
-        self, x: wp.array, b: wp.array, contact: Contact | None = None, reference: wp.array | None = None, prepared: bool = False
+        self,
+        x: wp.array,
+        b: wp.array,
+        contact: Contact | None = None,
+        reference: wp.array | None = None,
+        prepared: bool = False,
     ) -> None:
         """Launches the solution of K x = b.
 
