@@ -88,11 +88,8 @@ def test_initial_spin_is_about_the_centre_of_mass():
 
 
 def test_distances_follow_from_the_scene_size():
-    scene = Scene(
-        bodies=[Solid(name="s", mesh=BOX)],
-        obstacles=[Obstacle(name="floor", mesh=generators.Plane(size=100), minimum_separation=0.1)],
-    )
-    whole = assemble(scene)
+    floor = Obstacle(name="floor", mesh=generators.Plane(size=100), minimum_separation=0.1)
+    whole = assemble(Scene(bodies=[Solid(name="s", mesh=BOX)], obstacles=[floor]))
     assert whole.scene_size == pytest.approx(3**0.5), "obstacles do not count"
     assert whole.activation_distance == pytest.approx(1e-3 * 3**0.5)
     assert whole.minimum_separation == pytest.approx(2e-5 * 3**0.5)
@@ -131,7 +128,7 @@ def test_hard_pins_and_obstacles_follow_their_motion():
     later = whole.kinematic_positions(1.0)
     # the pins are at x = -0.5, z = -0.5 and 0.5; a quarter turn about their middle takes +z to +x
     assert later[:2] == pytest.approx(np.array([[-1, 0, 0], [0, 0, 0]]), abs=1e-12)
-    assert later[2:] == pytest.approx(whole.positions[25:] + [0, 2, 0])
+    assert later[2:] == pytest.approx(whole.positions[25:] + np.array([0, 2, 0]))
     assert np.all(whole.velocities[whole.kinematic_vertices] == 0)
     assert np.all(whole.velocities[[1, 2, 3]] == [1, 0, 0])
 

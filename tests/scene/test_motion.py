@@ -24,12 +24,9 @@ def test_spin_goes_beyond_a_full_turn_about_a_given_center():
 
 
 def test_keyframes_are_met_and_joined_by_straight_lines_and_even_turns():
-    keyframes = [
-        Keyframe(time=1),
-        Keyframe(time=3, translation=(0, 4, 0), rotation=(0, 0, 90)),
-        Keyframe(time=4, rotation=(0, 0, 90)),
-    ]
-    path = Trajectory(Motion(keyframes=keyframes), np.zeros(3))
+    up_and_turned = Keyframe(time=3, translation=(0, 4, 0), rotation=(0, 0, 90))
+    motion = Motion(keyframes=[Keyframe(time=1), up_and_turned, Keyframe(time=4, rotation=(0, 0, 90))])
+    path = Trajectory(motion, np.zeros(3))
     assert path.apply(POINT, 0.0) == pytest.approx(POINT)
     assert path.apply(POINT, 2.0) == pytest.approx(np.array([[0.5**0.5, 2 + 0.5**0.5, 0]]))
     assert path.apply(POINT, 3.0) == pytest.approx(np.array([[0, 5, 0]]))
@@ -62,9 +59,6 @@ def test_rotations_turn_about_x_then_y_then_z():
 
 def test_is_static_knows():
     still = [None, Motion(), Motion(keyframes=[Keyframe(time=0), Keyframe(time=1)])]
-    moving = [
-        Motion(velocity=(0, 0, 1)),
-        Motion(angular_velocity=(1, 0, 0)),
-        Motion(keyframes=[Keyframe(time=1, rotation=(1, 0, 0))]),
-    ]
+    turned = Motion(keyframes=[Keyframe(time=1, rotation=(1, 0, 0))])
+    moving = [Motion(velocity=(0, 0, 1)), Motion(angular_velocity=(1, 0, 0)), turned]
     assert [Trajectory(motion, np.zeros(3)).is_static for motion in still + moving] == [True] * 3 + [False] * 3

@@ -72,6 +72,7 @@ def _check(assembly: Assembly, precision: str) -> list[Finding]:
     for body in assembly.bodies:
         findings += _elements(assembly, body)
     findings += _selections(assembly)
+    findings += _motions(assembly)
     findings += _separation(assembly, precision)
     touching, found = _intersections(assembly)
     return findings + found + list(_too_close(assembly, touching)) + list(_inside(assembly, touching))
@@ -157,6 +158,18 @@ def _selections(assembly: Assembly) -> Iterator[Finding]:
         if len(force.vertices) == 0:
             yield Finding(
                 f"forces[{number}]", "acts on no vertex", "places are those at the start, in m, in the scene's coordinates"
+            )
+
+
+def _motions(assembly: Assembly) -> Iterator[Finding]:
+    scripts = [(_label(body), slice(body.first, body.last), body.trajectory) for body in assembly.bodies if body.trajectory]
+    for label, vertices, trajectory in scripts + [(f'body "{p.body}", a pin', p.vertices, p.trajectory) for p in assembly.pins]:
+        start = assembly.positions[vertices]
+        jump = np.linalg.norm(trajectory.apply(start, 0.0) - start, axis=1).max(initial=0.0)
+        if jump > 1e-9 * assembly.scene_size:
+            found = f"its motion begins {jump:.4g} m away from where it stands"
+            yield Finding(
+                label, found, "poses are relative to the start: place it there and let the first keyframe not move it"
             )
 
 

@@ -67,8 +67,9 @@ def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def center_of_mass(mesh: Mesh) -> np.ndarray:
     """Centroid of the tets, else of the triangles, of uniform density, m."""
     elements = mesh.tets if len(mesh.tets) else mesh.triangles
-    weights = (tet_volumes if len(mesh.tets) else triangle_areas)(mesh.vertices, elements)
-    return weights @ mesh.vertices[elements].mean(axis=1) / weights.sum()
+    weights = np.abs((tet_volumes if len(mesh.tets) else triangle_areas)(mesh.vertices, elements))
+    centers = mesh.vertices[elements].mean(axis=1)
+    return np.average(centers, axis=0, weights=weights) if weights.sum() > 0 else centers.mean(axis=0)
 
 
 def locate(name: str) -> Path:
