@@ -81,7 +81,7 @@ def test_clean_shapes_are_clean(shape, rotation):
 
 
 def test_cloth_through_itself_counts_every_pair():
-    sheet = generators.Grid(cells=(8, 8)).mesh()
+    sheet = generators.Grid(cells=(5, 5)).mesh()
     upright = sheet.vertices @ rotation_matrix((90, 0, 0)).T + [0.01, 0.013, 0.017]
     triangles = np.concatenate([sheet.triangles, sheet.triangles + len(upright)])
     positions = np.concatenate([sheet.vertices, upright])
@@ -93,7 +93,7 @@ def test_cloth_through_itself_counts_every_pair():
         if brute_force(positions[triangles[i]], positions[triangles[j]])
     ]
     assert pairs.tolist() == [list(pair) for pair in expected]
-    assert len(pairs) > 20
+    assert len(pairs) > 10
 
 
 def brute_force(a: np.ndarray, b: np.ndarray) -> bool:

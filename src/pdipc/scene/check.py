@@ -120,14 +120,13 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     if counts.max() > 1:
         found = f"{np.count_nonzero(counts > 1)} {kind} are there more than once"
         yield Finding(label, found, "each must be there once")
-    else:
-        sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, counts = np.unique(sides, axis=0, return_counts=True)
-        crowded = np.flatnonzero(counts > 2)
-        if len(crowded):
-            edge = (edges[crowded[0]] - first).tolist()
-            found = f"{len(crowded)} edges of its surface belong to more than two triangles, first {edge}"
-            yield Finding(label, found, "the surface must be a manifold: split it there")
+    sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, counts = np.unique(sides, axis=0, return_counts=True)
+    crowded = np.flatnonzero(counts > 2)
+    if len(crowded):
+        edge = (edges[crowded[0]] - first).tolist()
+        found = f"{len(crowded)} edges of its surface belong to more than two triangles, first {edge}"
+        yield Finding(label, found, "the surface must be a manifold: split it there")
     unused = np.setdiff1d(np.arange(first, body.last), elements)
     if len(unused):
         found = f"{len(unused)} vertices belong to no {kind[:-1]}, first vertex {unused[0] - first}"
