@@ -13,20 +13,24 @@ def _solver_name() -> str:
 
 
 class Cholesky:
-    """A factorised symmetric positive definite matrix, given by its upper triangle (diagonal included) in CSR.
+    """Solves with a symmetric positive definite matrix, given by its upper triangle (diagonal included) in CSR.
 
     MKL's PARDISO where pypardiso is installed, as the paper's IPC has it; else CHOLMOD.
     """
 
     name = _solver_name()
 
-    def __init__(self, upper: sp.csr_matrix):
-        upper.sort_indices()
+    def __init__(self):
         if self.name.startswith("MKL"):
             from pypardiso import PyPardisoSolver
 
-            self._matrix = upper
             self._solver = PyPardisoSolver(mtype=2)
+
+    def factorize(self, upper: sp.csr_matrix) -> "Cholesky":
+        """Factorises anew."""
+        if self.name.startswith("MKL"):
+            upper.sort_indices()
+            self._matrix = upper
             self._solver.set_phase(12)
             self._solver._call_pardiso(upper, np.zeros((upper.shape[0], 1)))
             self._solver.set_phase(33)
@@ -35,6 +39,7 @@ class Cholesky:
 
             full = (upper + sp.triu(upper, 1).T).tocsc()
             self._solver = CholeskySolverD(full.shape[0], full.indptr, full.indices, full.data, MatrixType.CSC)
+        return self
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """A^-1 b for b (n,) or (n, m)."""

@@ -59,6 +59,13 @@ class Isotropic:
         p = self.values(s)[0]
         return np.einsum("kij,kj,klj->kil", u[:, :, : p.shape[1]], p, v)
 
+    def squared_distance(self, f: np.ndarray) -> np.ndarray:
+        """|F - P(F)|^2 = |s - p|^2, (k,)."""
+        (s,) = _in_parts(lambda part: (np.linalg.svd(part, compute_uv=False),), f)
+        if f.shape[2] == 3:
+            s[:, 2] *= np.sign(np.linalg.det(f))
+        return ((s - self.values(s)[0]) ** 2).sum(axis=1)
+
     def linearize(self, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """P, and dP/dF = sum_q c_q T_q T_q^T as c (k, q) and T (k, q, 3, r)."""
         u, s, v = _svd(f)
@@ -147,6 +154,10 @@ class Length:
         """The vector of the right length in the same direction, (k, 3, 1)."""
         return f * (self.lengths / np.maximum(np.linalg.norm(f[:, :, 0], axis=1), SMALLEST))[:, None, None]
 
+    def squared_distance(self, f: np.ndarray) -> np.ndarray:
+        """|F - P(F)|^2, (k,)."""
+        return (np.linalg.norm(f[:, :, 0], axis=1) - self.lengths) ** 2
+
     def linearize(self, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """P; and dP/dF, which scales what is across F by L / |F|."""
         size = np.maximum(np.linalg.norm(f[:, :, 0], axis=1), SMALLEST)
@@ -168,6 +179,10 @@ class Fixed:
     def project(self, f: np.ndarray) -> np.ndarray:
         """The given values."""
         return np.broadcast_to(self.values, f.shape)
+
+    def squared_distance(self, f: np.ndarray) -> np.ndarray:
+        """|F - P|^2, (k,)."""
+        return ((f - self.values) ** 2).sum(axis=(1, 2))
 
     def linearize(self, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The given values, which do not depend on F."""
@@ -195,8 +210,7 @@ class Term:
 
     def energy(self, x: np.ndarray) -> float:
         """In joules."""
-        f = self.maps(x)
-        return 0.5 * float(self.weight @ ((f - self.manifold.project(f)) ** 2).sum(axis=(1, 2)))
+        return 0.5 * float(self.weight @ self.manifold.squared_distance(self.maps(x)))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """dE/dx per stencil vertex, (k, s, 3)."""

@@ -16,7 +16,8 @@ from .common import BlockPattern, Cholesky, scatter
 from .contact import DistanceBarrier, SquaredDistanceBarrier
 from .energies import Term
 
-ROUNDING = 1e-12  # rise of the energy that a line search takes for rounding, of the energy and of that of the predicted motion
+ROUNDING = 1e-12  # rise of the energy that a search takes for rounding, of the energy and that of the predicted motion;
+NEGLIGIBLE = 1e-6  # or of the kinetic energy of all moving by the tolerance
 LAG_ITERATIONS = 30  # iterations that may move kinematic vertices towards their targets
 
 
@@ -52,6 +53,7 @@ class Problem:
         weight = self.masses / self.time_step**2 + self.damping * self.masses / self.time_step
         inertia[:, 0, range(3), 0, range(3)] = weight[:, None]
         self.inertia = inertia
+        self.cholesky = Cholesky()
 
 
 @dataclass
@@ -82,13 +84,16 @@ class Info:
 class _Step:
     """The objective of one step."""
 
-    def __init__(self, problem: Problem, state: State, acceleration: np.ndarray):
+    def __init__(self, problem: Problem, state: State, acceleration: np.ndarray, tolerance: float):
         h, self.problem, self.start = problem.time_step, problem, state.positions
         self.z = state.positions + h * state.velocities + h * h * acceleration
         self.friction = None
+        self._elastic: tuple[np.ndarray | None, float] = (None, 0.0)  # the last positions asked for, and their elastic energy
         free = problem.free
         motion = (self.z - self.start)[free]
-        self.predicted = 0.5 / h**2 * float(problem.masses[free] @ (motion**2).sum(axis=1))  # J
+        predicted = float(problem.masses[free] @ (motion**2).sum(axis=1))
+        negligible = problem.masses[free].sum() * tolerance**2
+        self.rounding = 0.5 / h**2 * (ROUNDING * predicted + NEGLIGIBLE * negligible)  # J
 
     def energy(self, x: np.ndarray, frozen_at: np.ndarray) -> float:
         p, h = self.problem, self.problem.time_step
@@ -98,8 +103,9 @@ class _Step:
         free = p.free
         total += 0.5 / h**2 * float(p.masses[free] @ ((x - self.z)[free] ** 2).sum(axis=1))
         total += 0.5 * p.damping / h * float(p.masses[free] @ ((x - self.start)[free] ** 2).sum(axis=1))
-        total += sum(term.energy(x) for term in p.terms)
-        return total + (self.friction.energy(x) if self.friction else 0.0)
+        if self._elastic[0] is not x:
+            self._elastic = (x, sum(term.energy(x) for term in p.terms))
+        return total + self._elastic[1] + (self.friction.energy(x) if self.friction else 0.0)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """dE/dx of the inertia alone, (n, 3)."""
@@ -136,7 +142,7 @@ class _Step:
             matrix = matrix + block.tocsr()
         started = time.perf_counter()
         direction = kinematic_motion.copy()
-        solution = Cholesky(matrix).solve(-gradient[p.free].ravel())
+        solution = p.cholesky.factorize(matrix).solve(-gradient[p.free].ravel())
         direction[p.free] = solution.reshape(-1, 3)
         info.solve_seconds += time.perf_counter() - started
         return direction
@@ -154,26 +160,27 @@ def step(
 ) -> tuple[State, Info]:
     """One step of h.
 
-    targets: (n, 3) m, where kinematic vertices shall be at its end; stay by default. They move within the line search, and a lag
-    is made up in the next step. acceleration: (n, 3) or (3,) m/s^2 beside gravity. tolerance: m, on the largest entry of the full
-    Newton direction. friction_iterations: how often friction is lagged anew (1 in Li et al.).
+    targets: (n, 3) m, where kinematic vertices shall be at its end; stay by default. They move within the line search, and a
+    lag is made up in the next step. acceleration: (n, 3) or (3,) m/s^2 beside gravity. tolerance: m, on the largest entry of
+    the full Newton direction. friction_iterations: how often friction is lagged anew (1 in Li et al.).
     """
     info, begun = Info(), time.perf_counter()
     h, kinematic = problem.time_step, problem.kinematic
     total = np.broadcast_to(
         np.asarray(problem.gravity) + (0.0 if acceleration is None else acceleration), state.positions.shape
     )
-    objective = _Step(problem, state, total)
+    objective = _Step(problem, state, total, tolerance)
     x = state.positions.copy()
     wanted = x if targets is None else targets
     motion = np.zeros_like(x)
     if problem.contact:
         problem.contact.ready(x)
     lagged = 0
-    for lag in range(friction_iterations):
+    for _ in range(friction_iterations):
+        before = info.iterations
         if problem.contact:
             objective.friction = problem.contact.friction_at(x, state.positions)
-        for iteration in range(max_iterations):
+        for _ in range(max_iterations):
             motion[kinematic] = wanted[kinematic] - x[kinematic]
             # every second iteration moves kinematic vertices, the others let the rest come after
             following = bool(motion.any())
@@ -191,7 +198,7 @@ def step(
             if fraction == 0.0 and not moves:
                 break
         info.converged = settled
-        if not settled or objective.friction is None or (lag and iteration == 0):
+        if not settled or objective.friction is None or info.iterations == before + 1:
             break
     info.lag = float(np.abs(wanted - x)[kinematic].max(initial=0.0))
     if problem.contact:
@@ -208,7 +215,7 @@ def _search(objective: _Step, x: np.ndarray, direction: np.ndarray, moves: bool,
     if contact:
         fraction = contact.surface.free_step(x, x + direction, contact.smallest_separation(x))
     before = objective.energy(x, x)
-    limit = np.inf if moves else before + ROUNDING * (before + objective.predicted)
+    limit = np.inf if moves else before + ROUNDING * before + objective.rounding
     while fraction > 1e-14:
         trial = x + fraction * direction
         after = objective.energy(trial, x)
