@@ -33,8 +33,8 @@ class Box(Shape):
     """A block, centred at the origin."""
 
     shape: Literal["box"] = "box"
-    size: Vector = Field((1.0, 1.0, 1.0), description="Extent along x, y, z, m.")
-    cells: tuple[Count, Count, Count] = Field((4, 4, 4), description="Cells along x, y, z; each is cut into six tets.")
+    size: Vector = Field(default=(1.0, 1.0, 1.0), description="Extent along x, y, z, m.")
+    cells: tuple[Count, Count, Count] = Field(default=(4, 4, 4), description="Cells along x, y, z; each is cut into six tets.")
 
     def mesh(self) -> Mesh:
         points, tets = lattice(self.cells)
@@ -45,11 +45,11 @@ class Sphere(Shape):
     """A ball, centred at the origin."""
 
     shape: Literal["sphere"] = "sphere"
-    radius: Length = Field(0.5, description="Radius, m.")
-    cells: Across = Field(8, description="Cells across the diameter.")
+    radius: Length = Field(default=0.5, description="Radius, m.")
+    cells: Across = Field(default=8, description="Cells across the diameter.")
 
     def mesh(self) -> Mesh:
-        points, tets = lattice((self.cells,) * 3)
+        points, tets = lattice((self.cells, self.cells, self.cells))
         return Mesh.of_tets(self.radius * rounded(points), tets)
 
 
@@ -57,9 +57,9 @@ class Cylinder(Shape):
     """A cylinder or rod along y, centred at the origin."""
 
     shape: Literal["cylinder"] = "cylinder"
-    radius: Length = Field(0.5, description="Radius, m.")
-    length: Length = Field(1.0, description="Extent along y, m.")
-    cells: tuple[Across, Count] = Field((6, 6), description="Cells across the diameter and along y.")
+    radius: Length = Field(default=0.5, description="Radius, m.")
+    length: Length = Field(default=1.0, description="Extent along y, m.")
+    cells: tuple[Across, Count] = Field(default=(6, 6), description="Cells across the diameter and along y.")
 
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells[0], self.cells[1], self.cells[0]))
@@ -71,10 +71,10 @@ class Capsule(Shape):
     """A cylinder along y between two half balls, centred at the origin."""
 
     shape: Literal["capsule"] = "capsule"
-    radius: Length = Field(0.25, description="Radius, m.")
-    length: Length = Field(0.5, description="Extent of the cylinder along y, without the half balls, m.")
+    radius: Length = Field(default=0.25, description="Radius, m.")
+    length: Length = Field(default=0.5, description="Extent of the cylinder along y, without the half balls, m.")
     cells: tuple[Annotated[int, Field(ge=2, le=1024, multiple_of=2)], Count] = Field(
-        (6, 4), description="Cells across the diameter (even), and along the cylinder."
+        default=(6, 4), description="Cells across the diameter (even), and along the cylinder."
     )
 
     def mesh(self) -> Mesh:
@@ -92,9 +92,9 @@ class Torus(Shape):
     """A ring around y, centred at the origin."""
 
     shape: Literal["torus"] = "torus"
-    major_radius: Length = Field(0.5, description="Radius of the ring's centre line, m; larger than minor_radius.")
-    minor_radius: Length = Field(0.2, description="Radius of its section, m.")
-    cells: tuple[Across, Annotated[int, Field(ge=3, le=4096)]] = Field((4, 24), description="Cells across and around.")
+    major_radius: Length = Field(default=0.5, description="Radius of the ring's centre line, m; larger than minor_radius.")
+    minor_radius: Length = Field(default=0.2, description="Radius of its section, m.")
+    cells: tuple[Across, Annotated[int, Field(ge=3, le=4096)]] = Field(default=(4, 24), description="Cells across and around.")
 
     def model_post_init(self, _) -> None:
         if self.minor_radius >= self.major_radius:
@@ -112,10 +112,10 @@ class Bowl(Shape):
     """A shell of a sphere, open at the top; the origin is the sphere's centre."""
 
     shape: Literal["bowl"] = "bowl"
-    radius: Length = Field(1.0, description="Inner radius, m.")
-    thickness: Length = Field(0.05, description="Thickness of the shell, outward, m.")
-    opening: float = Field(80.0, gt=0, le=150, description="Angle between the downward axis and the rim, degrees.")
-    cells: tuple[Across, Count] = Field((16, 1), description="Cells across the bowl, and through its thickness.")
+    radius: Length = Field(default=1.0, description="Inner radius, m.")
+    thickness: Length = Field(default=0.05, description="Thickness of the shell, outward, m.")
+    opening: float = Field(default=80.0, gt=0, le=150, description="Angle between the downward axis and the rim, degrees.")
+    cells: tuple[Across, Count] = Field(default=(16, 1), description="Cells across the bowl, and through its thickness.")
 
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells[0], self.cells[1], self.cells[0]))
@@ -131,10 +131,10 @@ class Stairs(Shape):
     """Solid steps that go down along +x; the origin is the middle of the lowest edge at the foot of the highest step."""
 
     shape: Literal["stairs"] = "stairs"
-    steps: Annotated[int, Field(ge=1, le=100)] = Field(5, description="Number of steps.")
-    rise: Length = Field(0.2, description="Height of a step, m.")
-    run: Length = Field(0.3, description="Depth of a step along x, m.")
-    width: Length = Field(2.0, description="Extent along z, m.")
+    steps: Annotated[int, Field(ge=1, le=100)] = Field(default=5, description="Number of steps.")
+    rise: Length = Field(default=0.2, description="Height of a step, m.")
+    run: Length = Field(default=0.3, description="Depth of a step along x, m.")
+    width: Length = Field(default=2.0, description="Extent along z, m.")
 
     def mesh(self) -> Mesh:
         n = self.steps
@@ -155,10 +155,10 @@ class Grid(Shape):
     """A flat rectangle of triangles in the plane of x and z, facing +y, centred at the origin."""
 
     shape: Literal["grid"] = "grid"
-    size: tuple[Length, Length] = Field((1.0, 1.0), description="Extent along x and z, m.")
-    cells: tuple[Count, Count] = Field((20, 20), description="Cells along x and z; each is cut into two triangles.")
+    size: tuple[Length, Length] = Field(default=(1.0, 1.0), description="Extent along x and z, m.")
+    cells: tuple[Count, Count] = Field(default=(20, 20), description="Cells along x and z; each is cut into two triangles.")
     diagonals: Literal["alternating", "parallel"] = Field(
-        "alternating", description='How cells are cut: "alternating" favours no direction, "parallel" cuts all alike.'
+        default="alternating", description='How cells are cut: "alternating" favours no direction, "parallel" cuts all alike.'
     )
 
     def mesh(self) -> Mesh:
@@ -178,7 +178,7 @@ class Plane(Shape):
     """A square floor of two triangles in the plane of x and z, facing +y, centred at the origin."""
 
     shape: Literal["plane"] = "plane"
-    size: Length = Field(10.0, description="Length of a side, m.")
+    size: Length = Field(default=10.0, description="Length of a side, m.")
 
     def mesh(self) -> Mesh:
         return Grid(size=(self.size, self.size), cells=(1, 1)).mesh()
@@ -194,8 +194,8 @@ def lattice(cells: tuple[int, int, int], ring: bool = False) -> tuple[np.ndarray
     """
     counts = np.array(cells)
     nodes = counts + 1 - np.array([0, 0, ring])
-    points = 2.0 * np.indices(nodes).reshape(3, -1).T / counts - 1.0
-    cell = np.indices(counts).reshape(3, -1).T
+    points = 2.0 * np.indices(tuple(nodes)).reshape(3, -1).T / counts - 1.0
+    cell = np.indices(tuple(counts)).reshape(3, -1).T
     outward = 2 * cell + 1 > counts  # per axis: does the cell's diagonal run up?
 
     def node(corner: np.ndarray) -> np.ndarray:

@@ -98,7 +98,8 @@ def _about(keys: list[str | int], models: list[type[BaseModel]]) -> str:
 def _follow(loc: tuple[str | int, ...], data: Any) -> tuple[list[str | int], list[type[BaseModel]]]:
     """The keys of `loc` without the tags that pydantic puts in for unions, and the models that may hold the last key."""
     keys: list[str | int] = []
-    models, holders = [Scene], [Scene]
+    models: list[type[BaseModel]] = [Scene]
+    holders = models
     for part in loc:
         known = any(part in model.model_fields for model in models)
         if not (known or isinstance(part, int) or (isinstance(data, dict) and part in data)):

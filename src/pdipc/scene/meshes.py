@@ -201,9 +201,9 @@ def _read_usd(path: Path):
             return points, np.array(tets.Get()).reshape(-1, 4), None
         counts = np.array(prim.GetAttribute("faceVertexCounts").Get())
         corners = np.array(prim.GetAttribute("faceVertexIndices").Get())
-        starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        fan = [corners[s[:, None] + [0, k, k + 1]] for k in range(1, counts.max() - 1) if len(s := starts[counts > k + 1])]
-        return points, None, np.concatenate(fan)
+        first = np.cumsum(counts) - counts
+        fans = [first[counts > k + 1, None] + np.array([0, k, k + 1]) for k in range(1, int(counts.max()) - 1)]
+        return points, None, corners[np.concatenate(fans)]
     raise SceneError(f'mesh file "{path}": holds no Mesh')
 
 
@@ -219,5 +219,5 @@ def tetrahedralize(mesh: Mesh, where: str) -> Mesh:
             f'{where}: "tetrahedralize" needs the extra: pip install "pdipc[tetrahedralize]"; or give a tetrahedral mesh'
         ) from error
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it works
-        vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]
+        vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]  # pyright: ignore
     return from_arrays(vertices, tets, None, f"{where}, tetrahedralized")

@@ -47,36 +47,38 @@ def _exactly_one(table: BaseModel, *names: str) -> None:
 class Simulation(Table):
     """How time advances."""
 
-    time_step: Positive = Field(0.01, le=1.0, description="Length h of a step, s.")
-    steps: int = Field(200, ge=0, description="Number of steps of a run.")
-    substeps: int = Field(1, ge=1, le=1000, description="Solves in a step, each of h / substeps.")
-    gravity: Vector = Field((0.0, -9.81, 0.0), description="Acceleration of every body, m/s^2.")
+    time_step: Positive = Field(default=0.01, le=1.0, description="Length h of a step, s.")
+    steps: int = Field(default=200, ge=0, description="Number of steps of a run.")
+    substeps: int = Field(default=1, ge=1, le=1000, description="Solves in a step, each of h / substeps.")
+    gravity: Vector = Field(default=(0.0, -9.81, 0.0), description="Acceleration of every body, m/s^2.")
     damping: NotNegative = Field(
-        0.0, le=1e4, description="Mass-proportional damping, 1/s: a free body loses this part of its velocity per second."
+        default=0.0,
+        le=1e4,
+        description="Mass-proportional damping, 1/s: the part of its velocity that a free body loses per second.",
     )
     precision: Literal["auto", "float32", "float64"] = Field(
-        "auto", description='Working precision; "auto" takes what measured faster on the device.'
+        default="auto", description='Working precision; "auto" takes what measured faster on the device.'
     )
-    device: str | None = Field(None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
+    device: str | None = Field(default=None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
     outer_tolerance: Positive = Field(
-        1e-5,
+        default=1e-5,
         le=1.0,
         description="A step has converged when an outer iteration moves no vertex further than this part of the scene size.",
     )
     max_outer: int = Field(
-        50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
+        default=50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
     )
-    inner_iterations: int = Field(5, ge=1, description="Local-global iterations in an outer iteration.")
+    inner_iterations: int = Field(default=5, ge=1, description="Local-global iterations in an outer iteration.")
     linear_solver: Literal[
         "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
-    ] = Field("pcg", description="Solver of the global step.")
-    linear_iterations: int = Field(10, ge=1, description="Most iterations of a global solve.")
+    ] = Field(default="pcg", description="Solver of the global step.")
+    linear_iterations: int = Field(default=10, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
-        1e-4, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
+        default=1e-4, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
-    solver_order: int = Field(2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
+    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
     budget_ms: Positive | None = Field(
-        None,
+        default=None,
         description="Time after which a step takes no further outer iteration, ms; results then depend on the machine.",
     )
 
@@ -85,25 +87,25 @@ class Contact(Table):
     """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
 
     method: Literal["barrier", "paper"] = Field(
-        "barrier",
+        default="barrier",
         description='"barrier" is force-consistent and converges to the IPC solution; "paper" is Eq. (6) as printed.',
     )
     activation_distance: Positive | None = Field(
-        None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
+        default=None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
     )
     minimum_separation: Positive | None = Field(
-        None,
+        default=None,
         description="Gap that no pair of surfaces ever closes (xi), m; absent: 0.02 activation_distance. Bodies may differ.",
     )
     stiffness_scale: Positive = Field(
-        3.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
+        default=3.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
     )
-    friction: NotNegative = Field(0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
-    friction_velocity: Positive = Field(1e-3, description="Sliding slower than this counts as sticking, m/s.")
-    restitution: float = Field(0.0, ge=0, le=1, description="Part of the approach speed that an impact gives back.")
-    broad_phase: Literal["auto", "bvh", "patches"] = Field("auto", description="How candidate pairs are found.")
+    friction: NotNegative = Field(default=0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
+    friction_velocity: Positive = Field(default=1e-3, description="Sliding slower than this counts as sticking, m/s.")
+    restitution: float = Field(default=0.0, ge=0, le=1, description="Part of the approach speed that an impact gives back.")
+    broad_phase: Literal["auto", "bvh", "patches"] = Field(default="auto", description="How candidate pairs are found.")
     truncation: Literal["per_vertex", "global"] = Field(
-        "per_vertex",
+        default="per_vertex",
         description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens.',
     )
 
@@ -111,8 +113,8 @@ class Contact(Table):
 # --- meshes and where they stand ---
 
 
-def _array(dtype: type, width: int) -> Any:
-    def read(value: Any) -> Any:
+def _rows(dtype: type, width: int) -> BeforeValidator:
+    def read(value: Any) -> np.ndarray:
         array = np.array(value, dtype=None if dtype is np.int32 else dtype)
         if array.size and dtype is np.int32 and array.dtype.kind not in "iu":
             raise ValueError("must be whole numbers")
@@ -120,20 +122,24 @@ def _array(dtype: type, width: int) -> Any:
             raise ValueError(f"has the shape {array.shape}; must be (n, {width})")
         return array.reshape(-1, width).astype(dtype)
 
-    return Annotated[np.ndarray, BeforeValidator(read), PlainSerializer(lambda array: array.tolist(), return_type=list)]
+    return BeforeValidator(read)
+
+
+_AS_LIST = PlainSerializer(lambda array: array.tolist(), return_type=list)
+Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST]
+Triangles = Annotated[np.ndarray, _rows(np.int32, 3), _AS_LIST]
+Tets = Annotated[np.ndarray, _rows(np.int32, 4), _AS_LIST]
 
 
 class Arrays(Table):
     """A mesh given by its numbers: tets for a solid, triangles for cloth and obstacles."""
 
-    vertices: _array(np.float64, 3) = Field(description="V (n, 3): rest positions, m.")
-    tets: _array(np.int32, 4) | None = Field(None, description="T (t, 4): indices into vertices.")
-    triangles: _array(np.int32, 3) | None = Field(
-        None, description="F (m, 3): indices into vertices; a solid's follow from its tets."
+    vertices: Points = Field(description="V (n, 3): rest positions, m.")
+    tets: Tets | None = Field(default=None, description="T (t, 4): indices into vertices.")
+    triangles: Triangles | None = Field(
+        default=None, description="F (m, 3): indices into vertices; a solid's follow from its tets."
     )
-    start: _array(np.float64, 3) | None = Field(
-        None, description="(n, 3): positions at the start where these differ from rest, m."
-    )
+    start: Points | None = Field(default=None, description="(n, 3): positions at the start where these differ from rest, m.")
 
     @model_validator(mode="after")
     def _check(self) -> "Arrays":
@@ -194,17 +200,17 @@ class Placed(Table):
         description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp), a shape, or arrays."
     )
     scale: Positive | tuple[Positive, Positive, Positive] = Field(
-        1.0, description="Factor on the mesh's coordinates; along x, y, z if three."
+        default=1.0, description="Factor on the mesh's coordinates; along x, y, z if three."
     )
     rotation: Vector = Field(
-        (0.0, 0.0, 0.0), description="Turns about the fixed axes x, then y, then z, degrees; about the mesh's origin."
+        default=(0.0, 0.0, 0.0), description="Turns about the fixed axes x, then y, then z, degrees; about the mesh's origin."
     )
-    translation: Vector = Field((0.0, 0.0, 0.0), description="Where the mesh's origin goes, m.")
+    translation: Vector = Field(default=(0.0, 0.0, 0.0), description="Where the mesh's origin goes, m.")
     friction: NotNegative | None = Field(
-        None, le=10.0, description="Friction coefficient; absent: that of `contact`. A pair takes the geometric mean."
+        default=None, le=10.0, description="Friction coefficient; absent: that of `contact`. A pair takes the geometric mean."
     )
     minimum_separation: Positive | None = Field(
-        None,
+        default=None,
         description="Gap kept between copies of this body, such as the thickness of cloth, m; two bodies keep the mean. "
         "Absent: that of `contact`.",
     )
@@ -216,46 +222,50 @@ class Placed(Table):
 class SolidMaterial(Table):
     """Isotropic and elastic."""
 
-    density: Positive = Field(1000.0, le=1e5, description="Mass per volume, kg/m^3.")
-    young_modulus: Positive = Field(1e5, le=1e12, description="Young's modulus, Pa.")
-    poisson_ratio: float = Field(0.4, ge=0, le=0.499, description="Poisson's ratio.")
+    density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
+    young_modulus: Positive = Field(default=1e5, le=1e12, description="Young's modulus, Pa.")
+    poisson_ratio: float = Field(default=0.4, ge=0, le=0.499, description="Poisson's ratio.")
 
 
 class ClothMaterial(Table):
     """A thin sheet: stretched by its membrane stiffness, bent by its bending stiffness."""
 
-    areal_density: Positive = Field(0.2, le=1e4, description="Mass per area, kg/m^2.")
+    areal_density: Positive = Field(default=0.2, le=1e4, description="Mass per area, kg/m^2.")
     thickness: Positive = Field(
-        1e-3, le=1.0, description="Thickness, m: turns young_modulus into the two stiffnesses; contact ignores it."
+        default=1e-3, le=1.0, description="Thickness, m: turns young_modulus into the two stiffnesses; contact ignores it."
     )
-    young_modulus: Positive | None = Field(None, le=1e12, description="Young's modulus, Pa; absent: 1e5.")
+    young_modulus: Positive | None = Field(default=None, le=1e12, description="Young's modulus, Pa; absent: 1e5.")
     membrane_stiffness: Positive | None = Field(
-        None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
+        default=None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
     )
-    poisson_ratio: float = Field(0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
+    poisson_ratio: float = Field(default=0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
     bending_stiffness: NotNegative | None = Field(
-        None, le=1e6, description="Flexural rigidity, N m; absent: membrane_stiffness thickness^2 / (12 (1 - poisson_ratio^2))."
+        default=None,
+        le=1e6,
+        description="Flexural rigidity, N m; absent: membrane_stiffness thickness^2 / 12 / (1 - poisson_ratio^2).",
     )
     bending: Literal["quadratic", "curved"] = Field(
-        "quadratic", description='"quadratic" for cloth that is flat at rest, "curved" keeps a curved rest shape.'
+        default="quadratic", description='"quadratic" for cloth that is flat at rest, "curved" keeps a curved rest shape.'
     )
     membrane: Literal["strain", "springs"] = Field(
-        "strain", description='"springs" replaces the triangles\' elasticity by one spring an edge.'
+        default="strain", description='"springs" replaces the triangles\' elasticity by one spring an edge.'
     )
 
     @model_validator(mode="after")
     def _fill(self) -> "ClothMaterial":
         """Completes the stiffnesses, so that readers find numbers; what was given stays known in `model_fields_set`."""
-        given = self.__dict__
-        if self.membrane_stiffness is None or "membrane_stiffness" not in self.model_fields_set:
-            given["membrane_stiffness"] = (self.young_modulus or 1e5) * self.thickness
-        elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, self.membrane_stiffness, rtol=1e-6):
+        stretch, bend = self.membrane_stiffness, self.bending_stiffness
+        if stretch is None or "membrane_stiffness" not in self.model_fields_set:
+            stretch = (self.young_modulus or 1e5) * self.thickness
+        elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, stretch, rtol=1e-6):
             raise ValueError(
-                f"membrane_stiffness = {self.membrane_stiffness} N/m contradicts young_modulus * thickness = "
+                f"membrane_stiffness = {stretch} N/m contradicts young_modulus * thickness = "
                 f"{self.young_modulus * self.thickness} N/m; give one of the two"
             )
-        if self.bending_stiffness is None or "bending_stiffness" not in self.model_fields_set:
-            given["bending_stiffness"] = self.membrane_stiffness * self.thickness**2 / (12 * (1 - self.poisson_ratio**2))
+        if bend is None or "bending_stiffness" not in self.model_fields_set:
+            bend = stretch * self.thickness**2 / (12 * (1 - self.poisson_ratio**2))
+        object.__setattr__(self, "membrane_stiffness", stretch)
+        object.__setattr__(self, "bending_stiffness", bend)
         return self
 
 
@@ -266,9 +276,9 @@ class Keyframe(Table):
     """Where something is at one time, relative to its start."""
 
     time: NotNegative = Field(description="Time, s.")
-    translation: Vector = Field((0.0, 0.0, 0.0), description="Displacement from the start, m.")
+    translation: Vector = Field(default=(0.0, 0.0, 0.0), description="Displacement from the start, m.")
     rotation: Vector = Field(
-        (0.0, 0.0, 0.0), description="Turns about the fixed axes x, then y, then z through `center`, degrees, from the start."
+        default=(0.0, 0.0, 0.0), description="Turn from the start, about the axes x, then y, then z through `center`, degrees."
     )
 
 
@@ -276,17 +286,17 @@ class Motion(Table):
     """A scripted rigid motion: keyframes, or a constant velocity and spin in a time window."""
 
     keyframes: list[Keyframe] = Field(
-        [],
+        default=[],
         description="Poses in order of time; held before the first and after the last. Between two, the shorter turn is taken.",
     )
-    smooth: bool = Field(False, description="Ease in and out between keyframes, without jumps of velocity.")
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="Velocity of `center`, m/s.")
-    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="Spin: direction is the axis, length the rate, rad/s.")
+    smooth: bool = Field(default=False, description="Ease in and out between keyframes, without jumps of velocity.")
+    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="Velocity of `center`, m/s.")
+    angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="Spin, rad/s: its direction is the axis.")
     center: Vector | None = Field(
-        None, description="Point at the start that rotations turn about, m; absent: the middle of the bounding box."
+        default=None, description="Point at the start that rotations turn about, m; absent: the middle of the bounding box."
     )
-    start: NotNegative = Field(0.0, description="When velocity and spin begin, s.")
-    end: Positive | None = Field(None, description="When they end, s; absent: never.")
+    start: NotNegative = Field(default=0.0, description="When velocity and spin begin, s.")
+    end: Positive | None = Field(default=None, description="When they end, s; absent: never.")
 
     @model_validator(mode="after")
     def _check(self) -> "Motion":
@@ -303,11 +313,11 @@ class Motion(Table):
 class Selection(Table):
     """Vertices of a body, chosen in one way; places are those at the start, in the scene's coordinates."""
 
-    vertices: list[Annotated[int, Field(ge=0)]] | None = Field(None, description="Indices into the body's vertices.")
-    box: tuple[Vector, Vector] | None = Field(None, description="Lower and upper corner, m.")
-    sphere: tuple[Vector, Positive] | None = Field(None, description="Centre and radius, m.")
-    nearest: Vector | None = Field(None, description="The one vertex nearest to this point, m.")
-    all: bool = Field(False, description="Every vertex.")
+    vertices: list[Annotated[int, Field(ge=0)]] | None = Field(default=None, description="Indices into the body's vertices.")
+    box: tuple[Vector, Vector] | None = Field(default=None, description="Lower and upper corner, m.")
+    sphere: tuple[Vector, Positive] | None = Field(default=None, description="Centre and radius, m.")
+    nearest: Vector | None = Field(default=None, description="The one vertex nearest to this point, m.")
+    all: bool = Field(default=False, description="Every vertex.")
 
     @model_validator(mode="after")
     def _check(self) -> "Selection":
@@ -321,9 +331,9 @@ class Pin(Table):
     """Vertices held where they start, or led along a motion."""
 
     select: Selection = Field(description="Which vertices.")
-    motion: Motion | None = Field(None, description="How the points that hold them move; absent: not at all.")
+    motion: Motion | None = Field(default=None, description="How the points that hold them move; absent: not at all.")
     stiffness: Positive | None = Field(
-        None, description="Of the spring from each vertex to its point, N/m; absent: held exactly."
+        default=None, description="Of the spring from each vertex to its point, N/m; absent: held exactly."
     )
 
 
@@ -332,15 +342,15 @@ class Attachment(Table):
 
     bodies: tuple[str, str] = Field(description="Names of the two bodies; an obstacle may be one; both may be the same.")
     pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] | None = Field(
-        None, description="Vertex of the first and of the second body, pair by pair."
+        default=None, description="Vertex of the first and of the second body, pair by pair."
     )
     within: Positive | None = Field(
-        None,
+        default=None,
         description="Attach each vertex of the first body to the nearest one of the second that is no further than this, m.",
     )
-    stiffness: Positive = Field(1000.0, description="Of each spring, N/m.")
+    stiffness: Positive = Field(default=1000.0, description="Of each spring, N/m.")
     rest_length: NotNegative | None = Field(
-        None, description="Length at which springs are at rest, m; absent: the one at the start."
+        default=None, description="Length at which springs are at rest, m; absent: the one at the start."
     )
 
     @model_validator(mode="after")
@@ -356,18 +366,18 @@ class Copies(Table):
     """A body repeated in a grid; the copies are called `name[0]`, `name[1]`, ... with x running fastest, then y, then z."""
 
     counts: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = Field(
-        (1, 1, 1), description="Copies along x, y, z."
+        default=(1, 1, 1), description="Copies along x, y, z."
     )
-    spacing: Vector = Field((1.0, 1.0, 1.0), description="From one copy to the next along x, y, z, m.")
+    spacing: Vector = Field(default=(1.0, 1.0, 1.0), description="From one copy to the next along x, y, z, m.")
 
 
 class Body(Placed):
     """What solids and cloth share."""
 
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="At the start, m/s.")
-    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="At the start, about the centre of mass, rad/s.")
-    pins: list[Pin] = Field([], description="Vertices that are held.")
-    copies: Copies | None = Field(None, description="Repeats the body in a grid.")
+    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, m/s.")
+    angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, about the centre of mass, rad/s.")
+    pins: list[Pin] = Field(default=[], description="Vertices that are held.")
+    copies: Copies | None = Field(default=None, description="Repeats the body in a grid.")
 
 
 class Solid(Body):
@@ -376,7 +386,7 @@ class Solid(Body):
     kind: Literal["solid"] = "solid"
     material: SolidMaterial = Field(default_factory=SolidMaterial, description="What it is made of.")
     tetrahedralize: bool = Field(
-        False, description='Fill a closed triangle mesh with tets on loading; needs the extra "tetrahedralize".'
+        default=False, description='Fill a closed triangle mesh with tets on loading; needs the extra "tetrahedralize".'
     )
 
 
@@ -390,15 +400,15 @@ class Cloth(Body):
 class Obstacle(Placed):
     """A rigid surface, open or closed, that moves as told and feels nothing."""
 
-    motion: Motion | None = Field(None, description="How it moves; absent: not at all.")
+    motion: Motion | None = Field(default=None, description="How it moves; absent: not at all.")
 
 
 # --- forces ---
 
 
 class _Window(Table):
-    start: NotNegative = Field(0.0, description="When it begins, s.")
-    end: Positive | None = Field(None, description="When it ends, s; absent: never.")
+    start: NotNegative = Field(default=0.0, description="When it begins, s.")
+    end: Positive | None = Field(default=None, description="When it ends, s; absent: never.")
 
     @model_validator(mode="after")
     def _check_window(self) -> "_Window":
@@ -412,9 +422,9 @@ class Wind(_Window):
 
     kind: Literal["wind"] = "wind"
     velocity: Vector = Field(description="Velocity of the air, m/s.")
-    air_density: Positive = Field(1.2, description="kg/m^3.")
-    drag: NotNegative = Field(1.0, description="Drag coefficient.")
-    bodies: list[str] | None = Field(None, description="Names of the bodies that feel it; absent: all.")
+    air_density: Positive = Field(default=1.2, description="kg/m^3.")
+    drag: NotNegative = Field(default=1.0, description="Drag coefficient.")
+    bodies: list[str] | None = Field(default=None, description="Names of the bodies that feel it; absent: all.")
 
 
 class VertexForce(_Window):
@@ -432,14 +442,14 @@ class VertexForce(_Window):
 class Scene(Table):
     """Everything that a simulation starts from."""
 
-    title: str = Field("", description="One line.")
-    description: str = Field("", description="What it shows.")
+    title: str = Field(default="", description="One line.")
+    description: str = Field(default="", description="What it shows.")
     simulation: Simulation = Field(default_factory=Simulation, description="How time advances.")
     contact: Contact = Field(default_factory=Contact, description="How surfaces keep apart.")
     bodies: list[Annotated[Solid | Cloth, Field(discriminator="kind")]] = Field(min_length=1, description="What is simulated.")
-    obstacles: list[Obstacle] = Field([], description="Rigid surfaces, static or scripted.")
-    attachments: list[Attachment] = Field([], description="Springs between bodies.")
-    forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field([], description="Beyond gravity.")
+    obstacles: list[Obstacle] = Field(default=[], description="Rigid surfaces, static or scripted.")
+    attachments: list[Attachment] = Field(default=[], description="Springs between bodies.")
+    forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field(default=[], description="Beyond gravity.")
 
     @model_validator(mode="after")
     def _check(self) -> "Scene":
