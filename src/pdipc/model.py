@@ -8,6 +8,19 @@ import scipy.sparse
 import warp as wp
 
 from pdipc import constraints
+from pdipc.constraints import (
+    curved_bending,
+    edge_length,
+    material,
+    point_attachment,
+    quadratic_bending,
+    tet_strain,
+    tet_volume,
+    tets,
+    triangle_area,
+    triangle_strain,
+    triangles,
+)
 from pdipc.contact import broad_phase, surface
 from pdipc.forces import ExternalForces
 from pdipc.linear.solver import Solver
@@ -122,6 +135,12 @@ class Model:
         vectors = [upload(name) for name in ("positions", "velocities", "accelerations")]
         return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
 
+    def move_anchors(self, time: float) -> None:
+        """Uploads where the points of soft pins are at `time`."""
+        soft = [pin for pin in self.assembly.pins if pin.stiffness is not None and len(pin.vertices)]
+        for pin, anchor in zip(soft, self.projector.anchors, strict=True):
+            anchor.assign(self.assembly.pin_targets(pin, time))
+
     @functools.cached_property
     def moves(self) -> bool:
         """Whether any kinematic vertex follows a motion."""
@@ -142,10 +161,10 @@ def build(scene: Scene, device: str | None = None) -> Model:
     Raises SceneError for what `pdipc.check_scene` finds, before anything is launched.
     """
     assembly = assemble(scene)
-    refuse(assembly)
     sim = scene.simulation
     place = Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
+    refuse(assembly, number.name)
     h = sim.time_step / sim.substeps
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)
@@ -208,5 +227,34 @@ def build(scene: Scene, device: str | None = None) -> Model:
 
 
 def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The projective constraints of all bodies (Section 3), and the lumped masses (n,) kg."""
-    raise NotImplementedError
+    """The projective constraints of all bodies (Section 3) and the lumped masses (n,) kg."""
+    x, n = assembly.rest_positions, len(assembly.positions)
+    sets, mass = [], np.zeros(n)
+    for body in assembly.bodies:
+        m = body.material
+        if body.kind == "solid":
+            strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
+            sets.append(tet_strain.rest(x, body.tets, strain))
+            if volume > 0.0:
+                sets.append(tet_volume.rest(x, body.tets, volume))
+            mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
+        elif body.kind == "cloth":
+            if m.membrane == "springs":
+                edges, stiffness = material.springs(x, body.triangles, m.membrane_stiffness)
+                sets.append(edge_length.rest(x, edges, stiffness))
+            else:
+                strain, area = material.cloth(m.membrane_stiffness, m.poisson_ratio)
+                sets.append(triangle_strain.rest(x, body.triangles, strain))
+                if area > 0.0:
+                    sets.append(triangle_area.rest(x, body.triangles, area))
+            bending = curved_bending if m.bending == "curved" else quadratic_bending
+            if m.bending_stiffness > 0.0:
+                sets.append(bending.rest(x, body.triangles, m.bending_stiffness))
+            mass += material.lumped_mass(n, body.triangles, m.areal_density * triangles.rest_shape(x, body.triangles)[1])
+    for pin in assembly.pins:
+        if pin.stiffness is not None:
+            sets.append(point_attachment.rest(assembly.pin_targets(pin, 0.0), pin.vertices, pin.stiffness))
+    for a in assembly.attachments:
+        pairs = np.stack([a.vertices_a, a.vertices_b], axis=1)
+        sets.append(edge_length.rest(x, pairs, a.stiffness, a.rest_lengths))
+    return sets, mass

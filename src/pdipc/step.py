@@ -148,6 +148,7 @@ class Work:
         """Where kinematic vertices go by `time`, and the external accelerations; only uploaded where they change."""
         if not self._scripted or model.moves:
             self.target.assign(model.kinematic_targets(time))
+            model.move_anchors(time)
         if not self._scripted or not model.external.constant:
             positions, velocities = state.positions.numpy(), state.velocities.numpy()
             self.acceleration.assign(model.external.accelerations(state.time, positions, velocities))

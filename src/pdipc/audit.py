@@ -1,0 +1,85 @@
+"""Energies, momenta and contact forces of a state: what a run prints, and what tests compare with mechanics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from pdipc.model import Model, State
+from pdipc.step import Work
+
+
+@dataclass
+class Audit:
+    """Energies in J; linear momentum (3,) in kg m/s and angular momentum about the origin (3,) in kg m^2/s.
+
+    gravity: potential energy with the origin as its zero. Kinematic vertices do not count.
+    """
+
+    time: float
+    kinetic: float
+    elastic: float
+    barrier: float
+    gravity: float
+    linear_momentum: np.ndarray
+    angular_momentum: np.ndarray
+
+    @property
+    def total(self) -> float:
+        """Sum of the four energies."""
+        return self.kinetic + self.elastic + self.barrier + self.gravity
+
+
+def _freeze(model: Model, state: State, work: Work) -> None:
+    if not work.candidates.covers(state.positions):
+        work.candidates.cover(state.positions, state.positions, model.settings.margin)
+    work.pairs.freeze(work.candidates, state.positions, state.positions)
+
+
+def audit(model: Model, state: State, work: Work) -> Audit:
+    """The energies and momenta of `state`."""
+    _freeze(model, state, work)
+    numbers = wp.zeros(2, dtype=model.real.scalar, device=model.device.warp)
+    model.projector.energy(state.positions, numbers, 0)
+    work.pairs.energy(numbers, 1)
+    elastic, barrier = (float(value) for value in numbers.numpy())
+    mass = model.external.mass[:, None]
+    x, v = state.positions.numpy().astype(np.float64), state.velocities.numpy().astype(np.float64)
+    gravity = np.asarray(model.scene.simulation.gravity)
+    return Audit(
+        time=state.time,
+        kinetic=0.5 * float((mass * v * v).sum()),
+        elastic=elastic,
+        barrier=barrier,
+        gravity=-float((mass * x * gravity).sum()),
+        linear_momentum=(mass * v).sum(axis=0),
+        angular_momentum=np.cross(x, mass * v).sum(axis=0),
+    )
+
+
+def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
+    """(n, 3) N: the barrier's force on every vertex, on obstacles too; the resultant on a body is the sum over its vertices.
+
+    Without friction, which depends on a step and not on a state alone.
+    """
+    _freeze(model, state, work)
+    force = wp.zeros(model.vertex_count, dtype=model.real.vec3, device=model.device.warp)
+    work.pairs.linearize(state.positions, state.positions, state.positions, force)
+    return force.numpy().astype(np.float64)
+
+
+def vertex_areas(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(n,) m^2: a third of the triangles around each surface vertex, 0 inside."""
+    corners = positions[triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    total = np.zeros(len(positions))
+    for corner in range(3):
+        np.add.at(total, triangles[:, corner], area / 3.0)
+    return total
+
+
+def contact_pressures(model: Model, state: State, work: Work) -> np.ndarray:
+    """(n,) Pa: magnitude of the contact force over the area around each surface vertex."""
+    force = np.linalg.norm(contact_forces(model, state, work), axis=1)
+    area = vertex_areas(state.positions.numpy().astype(np.float64), model.triangles)
+    return np.where(area > 0.0, force / np.maximum(area, 1e-300), 0.0)

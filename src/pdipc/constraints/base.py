@@ -1,0 +1,56 @@
+"""What all kinds of constraints share: the rest data of many elements, and the constant matrix that they make."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse
+
+
+@dataclass(frozen=True)
+class ConstraintSet:
+    """Elements of one kind. Element e has the energy w_e/2 |G_e x - p_e|_F^2, p_e the local projection of G_e x, Eq. (2).
+
+    kind: name of the kind. vertices: (e, c) int32, the vertices of each element. gradient: (e, r, c), G; its r rows times the
+    c positions are r 3-vectors. weight: (e,), w. data: further rest data by name, each (e, ...).
+    """
+
+    kind: str
+    vertices: np.ndarray
+    gradient: np.ndarray
+    weight: np.ndarray
+    data: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def make_set(kind: str, vertices, gradient, weight, **data: np.ndarray) -> ConstraintSet:
+    """A `ConstraintSet` from arrays; a single weight holds for all elements.
+
+    Raises ValueError for an element whose weight is negative or not finite, or whose rest shape gave no finite gradient.
+    """
+    vertices = np.asarray(vertices, dtype=np.int32)
+    gradient = np.asarray(gradient, dtype=np.float64)
+    weight = np.broadcast_to(np.asarray(weight, dtype=np.float64), (len(vertices),)).copy()
+    bad = np.flatnonzero(~(np.isfinite(weight) & (weight >= 0.0)))
+    if len(bad):
+        raise ValueError(f"{kind} element {bad[0]}: the weight is {weight[bad[0]]}; it must be finite and not negative")
+    bad = np.flatnonzero(~np.isfinite(gradient).all(axis=(1, 2)))
+    if len(bad):
+        raise ValueError(
+            f"{kind} element {bad[0]} (vertices {vertices[bad[0]].tolist()}): the rest shape is degenerate; it must have a "
+            "positive length, area or volume"
+        )
+    return ConstraintSet(kind, vertices, gradient, weight, {name: np.asarray(value) for name, value in data.items()})
+
+
+def stiffness_matrix(count: int, sets: list[ConstraintSet]) -> scipy.sparse.csr_matrix:
+    """(count, count): sum of w G^T G, the constant part of Eq. (3) without the mass; the same for the three coordinates."""
+    rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for s in sets:
+        corners = s.vertices.shape[1]
+        rows.append(np.repeat(s.vertices, corners, axis=1).ravel())
+        columns.append(np.tile(s.vertices, (1, corners)).ravel())
+        values.append(np.einsum("e,eri,erj->eij", s.weight, s.gradient, s.gradient).ravel())
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.coo_matrix(triplets, shape=(count, count)).tocsr()

@@ -1,0 +1,71 @@
+"""Quadratic bending of sheets that are flat at rest (Wardetzky et al. 2007; Bergou et al. 2006).
+
+For the hinge of two triangles at an edge (x0, x1) with opposite vertices x2, x3, the row g of cotangents gives the mean
+curvature vector: g x = 0 when flat. The energy 3 k / (2 A) |g x|^2, with A the area of both triangles and k the flexural
+rigidity in N m, is quadratic: the projection is zero.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.constraints import rows
+from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.precision import Real
+
+NAME = "quadratic_bending"
+CORNERS = 4
+arguments = rows.arguments
+
+
+def hinges(triangles: np.ndarray) -> np.ndarray:
+    """(h, 4) int32: for every edge with two triangles its ends and the two vertices across."""
+    corner = np.arange(3)
+    edges = triangles[:, np.stack([corner, (corner + 1) % 3], axis=1)].reshape(-1, 2)
+    across = triangles[:, (corner + 2) % 3].reshape(-1)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    order = np.lexsort((high, low))
+    low, high, across = low[order], high[order], across[order]
+    second = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1])) + 1
+    return np.stack([low[second], high[second], across[second - 1], across[second]], axis=1).astype(np.int32)
+
+
+def curvature_rows(rest_positions: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """g (h, 4) and the areas (h,) of both triangles of each hinge, m^2."""
+    x0, x1, x2, x3 = (rest_positions[vertices[:, c]] for c in range(4))
+
+    def cotangent(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.einsum("ij,ij->i", a, b) / np.linalg.norm(np.cross(a, b), axis=1)
+
+    e = x1 - x0
+    c01, c02 = cotangent(e, x2 - x0), cotangent(e, x3 - x0)
+    c03, c04 = cotangent(-e, x2 - x1), cotangent(-e, x3 - x1)
+    g = np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1)
+    area = 0.5 * (np.linalg.norm(np.cross(e, x2 - x0), axis=1) + np.linalg.norm(np.cross(e, x3 - x0), axis=1))
+    return g, area
+
+
+def rest(rest_positions: np.ndarray, triangles: np.ndarray, bending_stiffness: float) -> ConstraintSet:
+    """Bending of the sheet `triangles` (m, 3). bending_stiffness: flexural rigidity k, N m. Raises ValueError for slivers."""
+    vertices = hinges(triangles)
+    g, area = curvature_rows(rest_positions, vertices)
+    return make_set(NAME, vertices, g[:, None, :], 3.0 * bending_stiffness / area, length=np.zeros(len(vertices)))
+
+
+def functions(real: Real) -> SimpleNamespace:
+    """project(v, length) = 0."""
+    scalar, vec3 = real.scalar, real.vec3
+
+    @wp.func
+    def project(v: vec3, length: scalar) -> vec3:
+        return vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+
+    return SimpleNamespace(project=project)
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    return rows.kernels(real, real.module(__name__), CORNERS, functions(real).project)

@@ -1,0 +1,99 @@
+"""The nearest rotation of a matrix: the hot spot of the local step.
+
+The rotation R that minimises |F - R|_F belongs to the signed singular values s1 >= s2 >= |s3| of F (s3 < 0 where F is
+inverted). With i1 = s1 + s2 + s3, i2 = s1 s2 + s2 s3 + s3 s1, i3 = det F, the Cayley-Hamilton theorem for the stretch S = R^T F
+gives R without any eigenvector:
+
+    R = (i1 cof F + (i1^2 - i2) F - F F^T F) / (i1 i2 - i3),     i2 = (i1^2 - |F|^2) / 2,
+
+and i1 is the largest root of the quartic (i1^2 - |F|^2)^2 = 4 |cof F|^2 + 8 i1 det F, which Newton's method finds from above,
+from sqrt(3) |F|, without a safeguard. The divisor is (s1 + s2) (s2 + s3) (s3 + s1): where it is nearly zero, the nearest
+rotation itself is ill-determined, and an SVD takes over. One Newton-Schulz step makes R orthogonal to rounding.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.precision import Real
+
+NEWTON_STEPS = 12  # at most; three or four are usual
+DEGENERATE = {"float32": 2.0e-2, "float64": 1.0e-4}  # of |F|^3: below, an SVD takes over
+
+
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    degenerate = wp.constant(scalar(DEGENERATE[real.name]))
+    settled = wp.constant(scalar(4.0 * real.unit_roundoff))
+
+    @wp.func
+    def cofactor(f: mat33) -> mat33:
+        """cof F = det(F) F^-T: its columns are the cross products of the columns of F."""
+        a = vec3(f[0, 0], f[1, 0], f[2, 0])
+        b = vec3(f[0, 1], f[1, 1], f[2, 1])
+        c = vec3(f[0, 2], f[1, 2], f[2, 2])
+        return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+    @wp.func
+    def orthonormalized(r: mat33) -> mat33:
+        """R (3 I - R^T R) / 2: squares the deviation from orthogonality."""
+        g = wp.transpose(r) * r
+        half = scalar(0.5)
+        return scalar(1.5) * r - half * (r * g)
+
+    @wp.func
+    def rotation_by_svd(f: mat33) -> mat33:
+        """The nearest rotation by a singular value decomposition: robust, and several times slower."""
+        u = mat33()
+        s = vec3()
+        v = mat33()
+        u, s, v = wp.svd3(f)
+        r = u * wp.transpose(v)
+        if wp.determinant(r) < scalar(0.0):
+            # turn the direction of the smallest singular value around
+            small = int(2)
+            if s[0] <= s[1] and s[0] <= s[2]:
+                small = 0
+            elif s[1] <= s[2]:
+                small = 1
+            for i in range(3):
+                u[i, small] = -u[i, small]
+            r = u * wp.transpose(v)
+        return orthonormalized(orthonormalized(r))
+
+    @wp.func
+    def nearest_rotation(f: mat33) -> mat33:
+        """argmin over rotations R of |F - R|_F; the identity for F = 0."""
+        size_sq = wp.ddot(f, f)
+        if not (size_sq > scalar(0.0)):
+            largest = wp.max(wp.max(wp.abs(f[0, 0]), wp.abs(f[1, 1])), wp.abs(f[2, 2]))
+            if not (largest > scalar(0.0)):
+                return wp.identity(n=3, dtype=scalar)
+        g = f / wp.sqrt(size_sq)  # |g| = 1
+        c = cofactor(g)
+        d = g[0, 0] * c[0, 0] + g[1, 0] * c[1, 0] + g[2, 0] * c[2, 0]
+        m = wp.ddot(c, c)
+        i1 = scalar(1.7320508075688772)
+        # p(i1) = (i1^2 - 1)^2 - 4 m - 8 d i1 is convex and increasing from its largest root on
+        for _ in range(NEWTON_STEPS):
+            q = i1 * i1 - scalar(1.0)
+            slope = scalar(4.0) * (i1 * q - scalar(2.0) * d)
+            step = (q * q - scalar(4.0) * m - scalar(8.0) * d * i1) / wp.max(slope, scalar(1.0e-30))
+            i1 -= step
+            if wp.abs(step) <= settled:
+                break
+        i2 = scalar(0.5) * (i1 * i1 - scalar(1.0))
+        divisor = i1 * i2 - d
+        if not (divisor > degenerate):
+            return rotation_by_svd(g)
+        r = (i1 * c + (i1 * i1 - i2) * g - g * (wp.transpose(g) * g)) / divisor
+        return orthonormalized(r)
+
+    return SimpleNamespace(
+        cofactor=cofactor,
+        orthonormalized=orthonormalized,
+        rotation_by_svd=rotation_by_svd,
+        nearest_rotation=nearest_rotation,
+    )
