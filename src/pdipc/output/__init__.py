@@ -1,0 +1,1 @@
+"""Results: run folders, pictures, exports, and the independent certificate."""

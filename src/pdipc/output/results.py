@@ -1,0 +1,306 @@
+"""A run as a folder that survives a kill at any moment.
+
+    run.json        what made it: versions, device, precision
+    scene.json      the scene as it was read
+    topology.npz    triangles, tets, body_of_vertex, scripted, body_names, body_kinds
+    frames/         000000.npy, ...: positions (n, 3) of each step, m
+    stats.jsonl     a line per frame: step, time, statistics of the step
+    checkpoints/    the last two states, bit for bit
+    segments/       with --certify: the ends of every committed motion
+
+Every file is written under a temporary name and then renamed; a frame counts once its line in stats.jsonl is complete.
+"""
+
+import json
+import math
+import os
+import platform
+import shutil
+import zipfile
+from collections.abc import Iterator
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1
+NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "frames", "checkpoints", "segments"}
+CHECKPOINTS_KEPT = 2
+UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
+
+
+class RunError(RuntimeError):
+    """A run folder that cannot be read, resumed or written."""
+
+
+class RunWriter:
+    """Writes a run. Made by `create` or `resume`."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    @classmethod
+    def create(
+        cls, folder: str | Path, scene: str, topology: dict[str, Any], meta: dict[str, Any], overwrite: bool = False
+    ) -> "RunWriter":
+        """A new run in `folder`. scene: as JSON. topology: arrays and lists by name, see above; meta: plain values.
+
+        Raises RunError where the folder holds a run already, unless `overwrite`, and always where it holds anything else.
+        """
+        folder = Path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise RunError(f"{folder} is a file; a run needs a folder")
+        present = {entry.name for entry in folder.iterdir() if not entry.name.endswith(".tmp")} if folder.exists() else set()
+        if foreign := sorted(present - NAMES):
+            raise RunError(f'{folder} holds other files, such as "{foreign[0]}"; name a new folder for the run')
+        if present and not overwrite:
+            raise RunError(f"{folder} holds a run already; go on with --resume, replace it with --overwrite, or name another")
+        for name in ("run.json", *sorted(present - {"run.json"})):
+            _remove(folder / name)
+        for name in ("frames", "checkpoints"):
+            (folder / name).mkdir(parents=True)
+        _write_text(folder / "scene.json", scene)
+        _write_arrays(folder / "topology.npz", topology)
+        _write_text(folder / "stats.jsonl", "")
+        _write_text(folder / "run.json", json.dumps({"format": FORMAT, **_versions(), **meta}, indent=2) + "\n")
+        return cls(folder)
+
+    @classmethod
+    def resume(cls, folder: str | Path) -> "RunWriter":
+        """Goes on after the last valid checkpoint of the run in `folder`; what was written after it is dropped.
+
+        Raises RunError where there is no run or no valid checkpoint.
+        """
+        run = open_run(folder)
+        writer = cls(run.folder)
+        checkpoint = writer.latest_checkpoint()
+        if checkpoint is None:
+            raise RunError(f"{folder} has no valid checkpoint to go on from; start again with --overwrite")
+        last = checkpoint[0]
+        kept = [record for record in run.records if record["step"] <= last]
+        _write_text(run.folder / "stats.jsonl", "".join(_line(record) for record in kept))
+        for path in [*run.folder.glob("*.tmp"), *run.folder.glob("*/*.tmp")]:
+            _remove(path)
+        for path in [path for name in ("frames", "checkpoints", "segments") for path in run.folder.glob(f"{name}/*.np?")]:
+            if int(path.stem.split("_")[0]) > last:
+                _remove(path)
+        return writer
+
+    def append(self, step: int, time: float, positions: np.ndarray, stats: dict[str, Any]) -> None:
+        """Adds the frame of `step`: positions (n, 3), m, at `time`, s, and the statistics of the step."""
+        positions = np.asarray(positions)
+        single = positions.astype(np.float32)
+        lossless = np.array_equal(single.astype(np.float64), positions)  # what a float32 simulation gives
+        _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
+        with open(self.folder / "stats.jsonl", "a") as file:
+            file.write(_line({"step": int(step), "time": float(time), **stats}))
+
+    def checkpoint(self, step: int, arrays: dict[str, Any]) -> None:
+        """Saves the state after `step`, bit for bit, and drops all but the last two."""
+        folder = self.folder / "checkpoints"
+        _write_arrays(folder / f"{step:06d}.npz", arrays)
+        for path in sorted(folder.glob("*.npz"))[:-CHECKPOINTS_KEPT]:
+            _remove(path)
+
+    def latest_checkpoint(self) -> tuple[int, dict[str, np.ndarray]] | None:
+        """Step and arrays of the newest checkpoint that is whole and whose frames are all there; None where there is none."""
+        run = open_run(self.folder)
+        steps = {record["step"] for record in run.records}
+        for path in sorted((self.folder / "checkpoints").glob("*.npz"), reverse=True):
+            step = int(path.stem)
+            try:
+                if step in steps:
+                    return step, _read_arrays(path)
+            except UNREADABLE:
+                continue
+        return None
+
+    def append_segments(self, step: int, outer: int, start: np.ndarray, end: np.ndarray) -> None:
+        """Records the motion (n, 3) -> (n, 3), m, that outer iteration `outer` of `step` committed."""
+        (self.folder / "segments").mkdir(exist_ok=True)
+        _write_arrays(self.folder / "segments" / f"{step:06d}_{outer:04d}.npz", {"start": start, "end": end})
+
+
+class Run:
+    """A run that was written, or is being written; opened by `open_run`.
+
+    folder: where it is. meta: versions, device, precision. scene: the scene as a dict, see `pdipc.scene.schema.Scene`.
+    topology: arrays by name. records: a dict per frame, with its step, time and statistics.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.meta: dict[str, Any] = _read_json(folder / "run.json")
+        if self.meta.get("format") != FORMAT:
+            raise RunError(f"{folder / 'run.json'}: format {self.meta.get('format')}; this version reads format {FORMAT}")
+        self.scene: dict[str, Any] = _read_json(folder / "scene.json")
+        try:
+            self.topology = _read_arrays(folder / "topology.npz")
+        except UNREADABLE as error:
+            raise RunError(f"{folder / 'topology.npz'} cannot be read: {error}") from error
+        self.records = _read_records(folder / "stats.jsonl")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames; frame 0 is the start."""
+        return len(self.records)
+
+    @property
+    def times(self) -> np.ndarray:
+        """(frame_count,) s."""
+        return np.array([record["time"] for record in self.records])
+
+    @property
+    def stats(self) -> list[dict[str, Any]]:
+        """Statistics, a dict a step; the start has none."""
+        return [record for record in self.records if record["step"] > 0]
+
+    def positions(self, frame: int) -> np.ndarray:
+        """(n, 3) float64, m. Negative frames count from the end. Raises IndexError where there is no such frame."""
+        try:
+            record = self.records[frame]
+        except IndexError:
+            raise IndexError(f"{self.folder} has no frame {frame}; it has {self.frame_count} frames") from None
+        path = self.folder / "frames" / f"{record['step']:06d}.npy"
+        try:
+            return np.load(path).astype(np.float64)
+        except UNREADABLE as error:
+            raise RunError(f"{path} cannot be read: {error}") from error
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """(m, 3) int32: all surfaces."""
+        return self.topology["triangles"]
+
+    @property
+    def tets(self) -> np.ndarray:
+        """(t, 4) int32: those of all solids."""
+        return self.topology["tets"]
+
+    @cached_property
+    def scripted(self) -> np.ndarray:
+        """(n,) bool: vertices whose motion is prescribed."""
+        return self.topology["scripted"]
+
+    @cached_property
+    def body_names(self) -> list[str]:
+        """Names of bodies, then of obstacles."""
+        return [str(name) for name in self.topology["body_names"]]
+
+    @cached_property
+    def body_kinds(self) -> list[str]:
+        """Per body: "solid", "cloth" or "obstacle"."""
+        return [str(kind) for kind in self.topology["body_kinds"]]
+
+    @cached_property
+    def body_of_triangle(self) -> np.ndarray:
+        """(m,) index into body_names."""
+        return self.topology["body_of_vertex"][self.triangles[:, 0]]
+
+    def body_mesh(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of one body: the vertices it uses (k,), and its triangles (m, 3) as indices into those."""
+        vertices, triangles = np.unique(self.triangles[self.body_of_triangle == body], return_inverse=True)
+        return vertices, triangles.reshape(-1, 3).astype(np.int32)
+
+    def segments(self) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
+        """Step, outer iteration, start (n, 3) and end (n, 3) of every motion recorded for the frames that count."""
+        last = self.records[-1]["step"] if self.records else -1
+        for path in sorted((self.folder / "segments").glob("*.npz")):
+            step, outer = (int(part) for part in path.stem.split("_"))
+            if step <= last:
+                try:
+                    arrays = _read_arrays(path)
+                    yield step, outer, arrays["start"].astype(np.float64), arrays["end"].astype(np.float64)
+                except UNREADABLE as error:
+                    raise RunError(f"{path} cannot be read: {error}") from error
+
+
+def open_run(folder: str | Path) -> Run:
+    """Reads the run in `folder`. Raises RunError where there is none, or it is damaged."""
+    folder = Path(folder)
+    if not folder.exists():
+        raise RunError(f"{folder} does not exist")
+    if not (folder / "run.json").is_file():
+        raise RunError(f"{folder} is not a run folder: it has no run.json")
+    return Run(folder)
+
+
+# --- files ---
+
+
+def _write(path: Path, write) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
+        write(file)
+    os.replace(temporary, path)
+
+
+def _write_text(path: Path, text: str) -> None:
+    _write(path, lambda file: file.write(text.encode()))
+
+
+def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    _write(path, lambda file: np.savez(file, **{name: np.asarray(array) for name, array in arrays.items()}))
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as arrays:  # verifies the checksum of each
+        return {name: arrays[name] for name in arrays.files}
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+
+
+def _read_records(path: Path) -> list[dict[str, Any]]:
+    """The complete lines; a last one that a kill cut short does not count."""
+    records = []
+    try:
+        lines = path.read_text().split("\n")[:-1]
+    except OSError as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+    for number, line in enumerate(lines, 1):
+        try:
+            records.append(json.loads(line))
+        except ValueError as error:
+            raise RunError(f"{path}, line {number}: {error}") from error
+    return records
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _line(record: dict[str, Any]) -> str:
+    return json.dumps({name: _plain(value) for name, value in record.items()}, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """JSON's kinds of value: NumPy's scalars and arrays unwrapped, None for what is not finite."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+    for name in ("pdipc", "warp-lang", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
