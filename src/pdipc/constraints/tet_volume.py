@@ -1,7 +1,7 @@
 """Preservation of volume. The projection of F is the nearest matrix with det P = 1 (Bouaziz et al. 2014, Section 5.3).
 
-It is found by D <- cof(F + D) (<cof(F + D), D> - (det(F + D) - 1)) / |cof(F + D)|^2, from D = 0: the iteration that Bouaziz et al.
-state for singular values, in terms of F itself, so that no SVD is needed.
+It is found by D <- cof(F + D) (<cof(F + D), D> - (det(F + D) - 1)) / |cof(F + D)|^2, from D = 0: the iteration that Bouaziz
+et al. state for singular values, in terms of F itself, so that no SVD is needed.
 """
 
 import functools
