@@ -192,8 +192,9 @@ def vertex_and_plane(
     method, one of METHODS: "pd" sets the nearest point of the plane as target of a vertex below it; "pd+ccd" rolls every
     iterate back to before its impact, which leaves nothing below the plane to push out; "pd+ipc+ccd" adds a barrier constraint
     with its target at d_hat; "eq6" takes the target of Eq. (6), x the start of the step and its velocity the predicted one;
-    "barrier" minimises inertia and the barrier energy, as IPC does and pdipc by default. weight: of the constraint, in m/h^2; kappa of "barrier".
-    activation: d_hat, m. backoff: part of the way to the impact that CCD allows. Raises ValueError for another method.
+    "barrier" minimises inertia and the barrier energy, as IPC does and pdipc by default. weight: of the constraint, in units of
+    m/h^2; for "barrier" its kappa. activation: d_hat, m. backoff: part of the way to the impact that CCD allows. Raises
+    ValueError for another method.
     """
     if method not in METHODS:
         raise ValueError(f"method: {method!r} is unknown; one of {', '.join(METHODS)}")
