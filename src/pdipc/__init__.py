@@ -1,5 +1,64 @@
-"""Penetration-free projective dynamics for soft bodies and cloth (Lan et al., SIGGRAPH 2022) on NVIDIA Warp."""
+"""Penetration-free projective dynamics for soft bodies and cloth (Lan et al., SIGGRAPH 2022) on NVIDIA Warp.
 
-import warp as _warp
+Names are imported when they are first used, so that reading a result or printing help does not load Warp.
+"""
 
-_warp.config.log_level = _warp.LOG_WARNING
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pdipc.contact.queries import time_of_impact as time_of_impact
+    from pdipc.model import build as build
+    from pdipc.output.results import RunError as RunError
+    from pdipc.output.results import open_run as open_run
+    from pdipc.scene.check import check as check_scene  # noqa: F401
+    from pdipc.scene.errors import SceneError as SceneError
+    from pdipc.scene.load import load_scene as load_scene
+    from pdipc.scene.schema import Scene as Scene
+    from pdipc.simulate import Simulation as Simulation
+    from pdipc.simulate import run_scene as run_scene
+    from pdipc.simulate import simulate as simulate
+    from pdipc.step import step as step
+    from pdipc.witness import find_intersections as find_intersections
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "RunError": "pdipc.output.results",
+    "Scene": "pdipc.scene.schema",
+    "SceneError": "pdipc.scene.errors",
+    "Simulation": "pdipc.simulate",
+    "build": "pdipc.model",
+    "check_scene": "pdipc.scene.check:check",
+    "find_intersections": "pdipc.witness",
+    "load_scene": "pdipc.scene.load",
+    "open_run": "pdipc.output.results",
+    "run_scene": "pdipc.simulate",
+    "simulate": "pdipc.simulate",
+    "step": "pdipc.step",
+    "time_of_impact": "pdipc.contact.queries",
+}
+
+
+class _Package(ModuleType):
+    """`pdipc.step` and `pdipc.simulate` are the functions, also once the modules of these names have been imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _PUBLIC and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _PUBLIC[name].partition(":")
+    return getattr(importlib.import_module(module), attribute or name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*_PUBLIC, "__version__"])

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+wp.config.log_level = wp.LOG_WARNING  # no banner; every module that uses Warp imports this one
+
 
 @dataclass(frozen=True)
 class Real:
