@@ -1,0 +1,5 @@
+"""`python -m pdipc`."""
+
+from pdipc.cli import app
+
+app()
