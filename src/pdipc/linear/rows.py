@@ -21,7 +21,7 @@ SLICE = 32  # rows of a slice on CUDA
 class Rows:
     """A sparse matrix of scalars on the device.
 
-    offsets: first entry of each row (CPU) or slice (CUDA). columns, values: (entries,), padded with zeros on the row's own column.
+    offsets: first entry of each row (CPU) or slice (CUDA). columns, values: (entries,), padded by zeros in the row's column.
     positions: (nnz,) host array, where the entries of the SciPy matrix went.
     arguments: what `row_product` takes after the row.
     """

@@ -4,14 +4,15 @@ Conjugate gradients find it on the way: their alpha and beta are the entries of 
 D^-1/2 A D^-1/2, whose extreme eigenvalues approach the matrix's own from inside. The three coordinates of a random start
 make one long vector for A (x) I3, which has the same eigenvalues.
 
-Contacts do not widen the interval beyond max(hi, 1): the block Omega that they add to the diagonal dominates the Hessian C
-that they add to the matrix, and 0 <= C <= Omega, 0 < lo D <= A <= hi D give lo* (D + Omega) <= A + C <= max(hi, 1) (D + Omega),
-with lo* below lo only as far as Omega is coarser than C.
+Contacts do not widen the interval beyond max(hi, 1): the blocks Omega that they add to the diagonal dominate the Hessian C that
+they add to the matrix, and A <= hi D with C <= Omega gives A + C <= max(hi, 1) (D + Omega). The lower end may sink, where
+Omega is coarser than C; Chebyshev's iteration then takes longer, but does not diverge.
 """
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 import warp as wp
 
 if TYPE_CHECKING:
@@ -32,11 +33,11 @@ def interval(system: "System") -> tuple[float, float]:
     start = np.random.default_rng(0).standard_normal((system.count, 3)) * np.sqrt(np.abs(system.matrix.diagonal()))[:, None]
     b = wp.array(start.astype(system.real.numpy), dtype=system.real.vec3, device=system.device.warp)
     x = wp.zeros(system.count, dtype=system.real.vec3, device=system.device.warp)
-    solver.solve(x, b)
+    system.device.capture(lambda: solver.solve(x, b), solver).launch()
     count = int(solver.iterations.numpy()[0])
     alpha, beta = solver.steps.numpy()[:count].astype(np.float64).T
     diagonal = 1.0 / alpha
     diagonal[1:] += beta[:-1] / alpha[:-1]
     beside = np.sqrt(beta[:-1]) / alpha[:-1]
-    ritz = np.linalg.eigvalsh(np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1))
+    ritz = scipy.linalg.eigvalsh_tridiagonal(diagonal, beside)
     return float(ritz[0] * (1.0 - MARGIN)), float(ritz[-1] * (1.0 + MARGIN))
