@@ -144,6 +144,16 @@ def _unit_product(s: np.ndarray):
     return p, np.linalg.inv(system)[:, :r, :r]
 
 
+def nearest_isometry() -> Isotropic:
+    """Rotations for tets, isometries for triangles: strain."""
+    return Isotropic(_ones)
+
+
+def unit_product() -> Isotropic:
+    """Maps of determinant, or area, one: preservation of volume and area."""
+    return Isotropic(_unit_product)
+
+
 class Length:
     """Vectors (r = 1) of given lengths (k,): springs, and bending of a curved rest shape."""
 
@@ -284,22 +294,22 @@ def triangle_areas(rest: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def tet_strain(rest: np.ndarray, tets: np.ndarray, weight: np.ndarray) -> Term:
     """As rigid as possible: w/2 |F - R|^2 a tet. weight: 2 mu V, J."""
-    return Term(tets, _difference_operator(rest[tets]), weight, Isotropic(_ones))
+    return Term(tets, _difference_operator(rest[tets]), weight, nearest_isometry())
 
 
 def tet_volume(rest: np.ndarray, tets: np.ndarray, weight: np.ndarray) -> Term:
     """Volume preservation: w/2 of the squared distance of F to det F = 1."""
-    return Term(tets, _difference_operator(rest[tets]), weight, Isotropic(_unit_product))
+    return Term(tets, _difference_operator(rest[tets]), weight, unit_product())
 
 
 def triangle_strain(rest: np.ndarray, triangles: np.ndarray, weight: np.ndarray) -> Term:
     """w/2 |F - nearest isometry|^2 a triangle. weight: 2 mu t A, J."""
-    return Term(triangles, _difference_operator(in_plane(rest[triangles])), weight, Isotropic(_ones))
+    return Term(triangles, _difference_operator(in_plane(rest[triangles])), weight, nearest_isometry())
 
 
 def triangle_area(rest: np.ndarray, triangles: np.ndarray, weight: np.ndarray) -> Term:
     """Area preservation: w/2 of the squared distance of the 3 x 2 map F to area 1."""
-    return Term(triangles, _difference_operator(in_plane(rest[triangles])), weight, Isotropic(_unit_product))
+    return Term(triangles, _difference_operator(in_plane(rest[triangles])), weight, unit_product())
 
 
 def springs(pairs: np.ndarray, lengths: np.ndarray, stiffness: np.ndarray) -> Term:
