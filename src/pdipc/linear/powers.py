@@ -102,6 +102,11 @@ class MatrixPowers(jacobi.Chebyshev):
         self._x2, self._before2 = self.zeros(self.real.vec3), self.zeros(self.real.vec3)
         self._grouped = group_kernels(self.real, self.capacity)
 
+    @property
+    def bytes(self) -> int:
+        """Memory of the groups' rows and indices on the device."""
+        return sum(array.capacity for array in self._group_arrays)
+
     def _plan(self, group: int | None) -> None:
         """Groups, their rings and their rows; smaller groups until they fit into fast memory."""
         system, order = self.system, self.order

@@ -82,15 +82,15 @@ class Run:
         self.solver = make_solver(name, system, tolerance=0.0, max_iterations=20_000, **options)
         self.x = wp.zeros(system.count, dtype=system.real.vec3, device=system.device.warp)
         self.b = wp.array(b.astype(system.real.numpy), dtype=system.real.vec3, device=system.device.warp)
+        self.solver.prepare(None)
 
     def graph(self, count: int) -> Graph:
-        """The recorded solve with `count` iterations; the diagonal is prepared already."""
+        """The recorded solve with `count` iterations; what depends on the matrix alone is prepared."""
         self.solver.limits[1] = count * (self.solver.order if self.name == "matrix-powers" else 1)
         return self.system.device.capture(lambda: self.solver.solve(self.x, self.b, prepared=True), self.solver)
 
     def result(self, count: int) -> np.ndarray:
         """x after `count` iterations."""
-        self.solver.prepare(None)
         self.x.zero_()
         self.graph(count).launch()
         return self.x.numpy().astype(np.float64)
@@ -107,10 +107,12 @@ class Run:
             best = min(best, time.perf_counter() - begin)
         return best
 
-    def per_iteration(self, count: int = 20) -> tuple[float, float]:
+    def per_iteration(self) -> tuple[float, float]:
         """Seconds to begin a solve and seconds an iteration takes: all of a solver's iterations cost the same."""
-        short, long = self.seconds(2), self.seconds(2 + count)
-        step = max((long - short) / count, 1e-9)
+        short, count = self.seconds(2), 16
+        while (long := self.seconds(2 + count)) < max(4.0 * short, 0.004) and count < 10_000:
+            count *= 2
+        step = (long - short) / count
         return max(short - 2.0 * step, 0.0), step
 
 
