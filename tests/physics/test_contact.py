@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import floor, scene, solid, watched
+from .scenes import floor, scene, solid, watched
 
 G = 9.81
 
@@ -11,7 +11,7 @@ def test_free_collision_conserves_linear_momentum():
     a = solid("a", (0.2, 0.2, 0.2), (2, 2, 2), at=(-0.15, 0, 0), velocity=(2, 0, 0), density=500)
     b = solid("b", (0.2, 0.2, 0.2), (2, 2, 2), at=(0.15, 0.03, 0.02), velocity=(-1, 0, 0), rotation=(10, 20, 30))
     simulation = watched(scene([a, b], gravity=(0, 0, 0), time_step=0.01, max_outer=100))
-    mass = simulation.model.mass_numpy[:, None]
+    mass = simulation.model.external.mass[:, None]
 
     def momentum():
         return (mass * simulation.state.velocities.numpy()).sum(axis=0)
@@ -35,7 +35,7 @@ def slide(angle, friction, seconds, h=0.01):
     ground = floor(20.0, rotation=(0, 0, -angle), friction=friction)
     contact = {"activation_distance": 2e-3}
     simulation = watched(scene([block], [ground], contact=contact, time_step=h, max_outer=200))
-    mass = simulation.model.mass_numpy[:, None]
+    mass = simulation.model.external.mass[:, None]
     speeds = []
     for _ in range(round(seconds / h)):
         simulation.step()

@@ -68,13 +68,13 @@ class Simulation(Table):
     max_outer: int = Field(
         default=50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
     )
-    inner_iterations: int = Field(default=5, ge=1, description="Local-global iterations in an outer iteration.")
+    inner_iterations: int = Field(default=30, ge=1, description="Most local-global iterations in an outer iteration.")
     linear_solver: Literal[
         "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
-    ] = Field(default="pcg", description="Solver of the global step.")
-    linear_iterations: int = Field(default=10, ge=1, description="Most iterations of a global solve.")
+    ] = Field(default="two-level", description="Solver of the global step.")
+    linear_iterations: int = Field(default=20, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
-        default=1e-4, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
+        default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
     solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
     budget_ms: Positive | None = Field(
