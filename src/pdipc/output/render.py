@@ -1,23 +1,23 @@
 """Pictures and animations of a run, drawn off-screen with PyVista."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pdipc.output.results import Run, RunError
 
-if TYPE_CHECKING:
-    import pyvista
-
 STILL = (".png", ".jpg")
 MOVING = (".gif", ".mp4")
 PALETTE = ("#3f87c5", "#f0803c", "#4fae7b", "#e2b33c", "#9a72c0", "#dc5f7c", "#3fb0b5", "#a9825a")
-OBSTACLE = "#d3d6db"
-BACKGROUND = ("#dfe4ea", "#ffffff")  # bottom, top
+OBSTACLE = "#c4c9d0"
+OPACITY = 0.3  # of obstacles above the bodies, which would hide them
+FLOOR = "#dde1e6"
+BACKGROUND = "#f8f9fb"
 SHARP_EDGE = 40.0  # degrees: sharper edges are not shaded smoothly
-REACH = 9.0  # obstacles are drawn up to so many radii of what moves; a floor may be as large as it likes
-VIEW = (0.7, 0.5, 1.0)  # from the middle of the bodies towards the camera
+LARGE = 2.0  # an obstacle of more than so many times the size of what moves is not framed
+REACH = 5.0  # a floor is drawn up to so many radii of what moves
+OCCLUDERS = 4000  # triangles, whole or quartered, that are taken to shade a floor
+VIEW = (0.7, 0.42, 1.0)  # from the middle of the bodies towards the camera
 ANGLE = 28.0  # degrees: vertical field of view
 FASTEST = 50.0  # frames a second that players show
 
@@ -78,16 +78,21 @@ class Picture:
 
         self.run = run
         self.plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
-        self.plotter.set_background(BACKGROUND[0], top=BACKGROUND[1])
-        self.bodies: list[_Body] = []
-        start = run.positions(frames[0])
+        self.plotter.set_background(BACKGROUND)
         low, high = self._bounds(frames)
         self.center, self.radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)) or 1.0
+        self.bodies: list[_Body | _Floor] = []
+        start = run.positions(frames[0])
         for body, kind in enumerate(run.body_kinds):
             vertices, triangles = run.body_mesh(body)
-            if len(triangles):
+            if not len(triangles):
+                continue
+            if kind == "obstacle" and _Floor.suits(start[vertices], self.center, self.radius):
+                self.bodies.append(_Floor(self, start, vertices, body))
+            else:
                 color = OBSTACLE if kind == "obstacle" else PALETTE[body % len(PALETTE)]
-                self.bodies.append(_Body(self, start, vertices, triangles, kind, color))
+                covers = kind == "obstacle" and start[vertices, 1].min() > self.center[1]
+                self.bodies.append(_Body(self, start, vertices, triangles, kind, color, OPACITY if covers else 1.0))
         self._light()
         self._look(np.array([low, high]), np.array(view, dtype=float), size[0] / size[1])
         self.plotter.enable_anti_aliasing("ssaa")
@@ -101,13 +106,18 @@ class Picture:
             body.move(positions)
 
     def _bounds(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Box around all that is no obstacle, over at most 30 of the frames; around everything where there is no such body."""
-        kinds = np.array(self.run.body_kinds)
-        shown = kinds[self.run.topology["body_of_vertex"]] != "obstacle"
-        shown = shown if shown.any() else np.ones_like(shown)
-        sampled = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 30).astype(int))]
-        points = [self.run.positions(frame)[shown] for frame in sampled]
-        return np.min([p.min(axis=0) for p in points], axis=0), np.max([p.max(axis=0) for p in points], axis=0)
+        """Box around the bodies, and the obstacles that are not much larger, over at most 30 of the frames."""
+        sampled = [self.run.positions(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, 30).astype(int))]
+        boxes = [self._box(sampled, body) for body in range(len(self.run.body_kinds))]
+        moving = [box for box, kind in zip(boxes, self.run.body_kinds, strict=True) if kind != "obstacle"] or boxes
+        size = LARGE * np.linalg.norm(np.ptp(np.concatenate(moving), axis=0))
+        framed = np.concatenate(moving + [box for box in boxes if np.linalg.norm(box[1] - box[0]) < size])
+        return framed.min(axis=0), framed.max(axis=0)
+
+    def _box(self, sampled: list[np.ndarray], body: int) -> np.ndarray:
+        own = self.run.topology["body_of_vertex"] == body
+        points = np.concatenate([positions[own] for positions in sampled])
+        return np.array([points.min(axis=0), points.max(axis=0)])
 
     def _look(self, box: np.ndarray, view: np.ndarray, aspect: float) -> None:
         """The camera as near as all corners of the box allow."""
@@ -127,12 +137,8 @@ class Picture:
     def _light(self) -> None:
         import pyvista
 
-        for direction, strength in (
-            ((-0.6, 1.0, 0.5), 0.62),
-            ((1.0, 0.6, 0.4), 0.28),
-            ((0.2, 0.3, -1.0), 0.2),
-            ((0, 1, 0), 0.2),
-        ):
+        lights = (((-0.5, 1.0, 0.8), 0.85), ((1.0, 0.5, 0.25), 0.5), ((0.1, 0.3, -1.0), 0.25), ((0.0, -1.0, 0.3), 0.15))
+        for direction, strength in lights:
             place = self.center + 50.0 * self.radius * np.array(direction)
             light = pyvista.Light(position=place, focal_point=self.center, intensity=strength, light_type="scene light")
             self.plotter.add_light(light)
@@ -142,31 +148,31 @@ class _Body:
     """The mesh of one body; its points are `vertices` of the run, doubled along sharp edges."""
 
     def __init__(
-        self, picture: Picture, positions: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, kind: str, color: str
+        self,
+        picture: Picture,
+        positions: np.ndarray,
+        vertices: np.ndarray,
+        triangles: np.ndarray,
+        kind: str,
+        color: str,
+        opacity: float,
     ):
         import pyvista
 
-        mesh = pyvista.PolyData.from_regular_faces(positions[vertices], triangles)
-        mesh["vertex"] = vertices
+        self.mesh = pyvista.PolyData.from_regular_faces(positions[vertices], triangles)
+        self.mesh["vertex"] = vertices
         if kind != "cloth":
-            mesh = mesh.compute_normals(split_vertices=True, feature_angle=SHARP_EDGE, consistent_normals=False)
-        self.vertices = np.asarray(mesh["vertex"])
-        self.mesh, self.drawn = mesh, mesh
-        self.center, self.reach = picture.center, REACH * picture.radius
-        self.clipped = kind == "obstacle" and np.abs(mesh.points - self.center).max() > self.reach
-        if self.clipped:
-            self.drawn = mesh.copy()
-        back = {"color": pyvista.Color(color).hex_rgb, "diffuse": 0.75, "ambient": 0.2} if kind == "cloth" else None
+            self.mesh = self.mesh.compute_normals(split_vertices=True, feature_angle=SHARP_EDGE, consistent_normals=False)
+        self.vertices = np.asarray(self.mesh["vertex"])
         picture.plotter.add_mesh(
-            self.drawn,
+            self.mesh,
             color=color,
+            opacity=opacity,
             smooth_shading=True,
-            scalars=None,
-            ambient=0.16,
-            diffuse=0.9,
-            specular=0.0 if kind == "obstacle" else 0.18,
+            ambient=0.22,
+            diffuse=0.85,
+            specular=0.0 if kind == "obstacle" else 0.15,
             specular_power=25,
-            backface_params=back,
         )
 
     def move(self, positions: np.ndarray) -> None:
@@ -174,8 +180,68 @@ class _Body:
         self.mesh.compute_normals(
             cell_normals=False, inplace=True, split_vertices=False, consistent_normals=False, auto_orient_normals=False
         )
-        if self.clipped:
-            cut = self.mesh
-            for axis in np.vstack([np.eye(3), -np.eye(3)]):
-                cut = cut.clip(normal=axis, origin=self.center + self.reach * axis)
-            self.drawn.copy_from(cut)
+
+
+class _Floor:
+    """A large plane, drawn as a disc that fades into the background, with the soft shade of what is near it.
+
+    The shade is the part of the half-space above that the bodies cover: form factors of their triangles.
+    """
+
+    def __init__(self, picture: Picture, positions: np.ndarray, vertices: np.ndarray, body: int):
+        import pyvista
+
+        self.picture, self.vertices = picture, vertices
+        disc = pyvista.Disc(inner=0.0, outer=1.0, r_res=56, c_res=96).triangulate()
+        spread = np.asarray(disc.points) / np.maximum(np.linalg.norm(disc.points, axis=1, keepdims=True), 1e-9)
+        self.flat = (spread * np.linalg.norm(disc.points, axis=1, keepdims=True) ** 1.6)[:, :2]  # denser near the middle
+        self.colors = [np.array(pyvista.Color(color).float_rgb) for color in (FLOOR, BACKGROUND)]
+        occluding = np.flatnonzero(picture.run.body_of_triangle != body)
+        self.occluders = picture.run.triangles[occluding[:: 1 + len(occluding) // OCCLUDERS]]
+        self.two_sided = (
+            np.array(picture.run.body_kinds)[picture.run.topology["body_of_vertex"][self.occluders[:, 0]]] == "cloth"
+        )
+        self.share = len(occluding) / max(1, len(self.occluders))
+        self.mesh = disc
+        self.move(positions)
+        picture.plotter.add_mesh(self.mesh, scalars="color", rgb=True, lighting=False)
+
+    @staticmethod
+    def suits(points: np.ndarray, center: np.ndarray, radius: float) -> bool:
+        """Whether the points (k, 3) span a flat rectangle that reaches well around what moves."""
+        _, extents, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+        along = (points - center) @ axes.T
+        reach = np.minimum(along.max(axis=0), -along.min(axis=0))[:2].min()
+        return len(points) >= 4 and bool(extents[2] < 1e-6 * extents[0]) and reach > 0.9 * radius
+
+    def move(self, positions: np.ndarray) -> None:
+        points, center = positions[self.vertices], self.picture.center
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        along = (points - center) @ axes.T
+        reach = min(np.minimum(along.max(axis=0), -along.min(axis=0))[:2].min(), REACH * self.picture.radius)
+        height = float(along[:, 2].mean())
+        self.mesh.points = center + reach * self.flat @ axes[:2] + height * axes[2]
+        shade = self._shade(positions, axes[2] * -np.sign(height or 1.0))[:, None]
+        faded = np.clip((np.linalg.norm(self.flat, axis=1, keepdims=True) - 0.35) / 0.6, 0.0, 1.0)
+        faded = faded * faded * (3.0 - 2.0 * faded)
+        near, far = self.colors
+        color = (1.0 - faded) * near * (1.0 - 0.6 * (1.0 - np.exp(-1.5 * shade))) + faded * far
+        self.mesh["color"] = (255.0 * color + 0.5).astype(np.uint8)
+
+    def _shade(self, positions: np.ndarray, up: np.ndarray) -> np.ndarray:
+        corners, two_sided = positions[self.occluders].astype(np.float32), self.two_sided
+        while 0 < 4 * len(corners) <= OCCLUDERS:
+            ends = 0.5 * (corners + np.roll(corners, -1, axis=1))  # middles of the edges 01, 12, 20
+            thirds = [np.stack([corners[:, k], ends[:, k], ends[:, k - 1]], axis=1) for k in range(3)]
+            corners, two_sided = np.concatenate([*thirds, ends]), np.tile(two_sided, 4)
+        area_normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        middle, area = corners.mean(axis=1), np.linalg.norm(area_normals, axis=1)
+        shade = np.zeros(len(self.mesh.points), dtype=np.float32)
+        for i, point in enumerate(np.asarray(self.mesh.points, dtype=np.float32)):
+            to = middle - point
+            square = np.einsum("ij,ij->i", to, to)
+            facing = -np.einsum("ij,ij->i", to, area_normals)
+            facing = np.where(two_sided, np.abs(facing), np.maximum(facing, 0.0))
+            facing += 0.4 * area**1.5 * np.exp(-square / (area + 1e-20))  # nearer than its size, a triangle is no point
+            shade[i] = np.sum(np.maximum(to @ up, 0.0) * facing / (square * (np.pi * square + area) + 1e-20))
+        return np.minimum(self.share * shade, 2.0)
