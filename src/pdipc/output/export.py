@@ -1,0 +1,114 @@
+"""The frames of a run for other programs: USD, PLY, OBJ, VTK."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pdipc.output.render import OBSTACLE, PALETTE
+from pdipc.output.results import Run, RunError
+
+FORMATS = ("usd", "ply", "obj", "vtk")
+USD_SUFFIXES = (".usd", ".usda", ".usdc")
+
+
+def export(run: Run, to: str, path: str | Path) -> Path:
+    """Writes all frames of `run` in the format `to` and returns where: see the function of each format.
+
+    Raises RunError for a run without frames, ValueError for an unknown format or suffix.
+    """
+    if to not in FORMATS:
+        raise ValueError(f'"{to}" is no export format; there are: {", ".join(FORMATS)}')
+    if run.frame_count == 0:
+        raise RunError(f"{run.folder} has no frames")
+    path = Path(path)
+    (path.parent if to == "usd" else path).mkdir(parents=True, exist_ok=True)
+    return {"usd": export_usd, "ply": export_ply, "obj": export_obj, "vtk": export_vtk}[to](run, path)
+
+
+def export_ply(run: Run, folder: Path) -> Path:
+    """frame_000000.ply, ...: the surfaces, binary, in float64, each triangle with its body's number."""
+    import trimesh
+
+    for frame in range(run.frame_count):
+        mesh = trimesh.Trimesh(run.positions(frame), run.triangles, process=False)
+        mesh.face_attributes["body"] = run.body_of_triangle.astype(np.int32)
+        data = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False, include_attributes=True)
+        (folder / f"frame_{frame:06d}.ply").write_bytes(data)
+    return folder
+
+
+def export_obj(run: Run, folder: Path) -> Path:
+    """frame_000000.obj, ...: the surfaces, an object a body, with digits that give the same float64 back."""
+    faces = []
+    for body, name in enumerate(run.body_names):
+        corners = run.triangles[run.body_of_triangle == body] + 1
+        faces.append(f"o {name}\n" + "".join(f"f {a} {b} {c}\n" for a, b, c in corners.tolist()))
+    for frame in range(run.frame_count):
+        vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in run.positions(frame).tolist())
+        (folder / f"frame_{frame:06d}.obj").write_text(vertices + "".join(faces))
+    return folder
+
+
+def export_vtk(run: Run, folder: Path) -> Path:
+    """run.pvd, which ParaView opens with all times, and frame_000000.vtu, ...: tets, and triangles of what has none."""
+    import meshio
+
+    kinds = np.array(run.body_kinds)
+    of_vertex = run.topology["body_of_vertex"]
+    surface = kinds[run.body_of_triangle] != "solid"
+    cells, bodies = [], []
+    for kind, elements in (("tetra", run.tets), ("triangle", run.triangles[surface])):
+        if len(elements):
+            cells.append((kind, elements))
+            bodies.append(of_vertex[elements[:, 0]].astype(np.int32))
+    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">', "<Collection>"]
+    for frame in range(run.frame_count):
+        name = f"frame_{frame:06d}.vtu"
+        meshio.Mesh(run.positions(frame), cells, cell_data={"body": bodies}).write(folder / name)
+        lines.append(f'<DataSet timestep="{float(run.times[frame])!r}" part="0" file="{name}"/>')
+    (folder / "run.pvd").write_text("\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
+    return folder / "run.pvd"
+
+
+def export_usd(run: Run, path: Path) -> Path:
+    """One .usd, .usda or .usdc file: a mesh a body below /Run, its points over time in seconds, y up, metres."""
+    from pxr import Gf, Usd, UsdGeom, Vt
+
+    if path.suffix.lower() not in USD_SUFFIXES:
+        raise ValueError(f'"{path}": a USD file ends in one of: {", ".join(USD_SUFFIXES)}')
+    path.unlink(missing_ok=True)
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    rate = (run.frame_count - 1) / float(run.times[-1]) if run.frame_count > 1 else 24.0
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(run.frame_count - 1)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Run").GetPrim())
+    meshes = []
+    for body, (name, kind) in enumerate(zip(run.body_names, run.body_kinds, strict=True)):
+        vertices, triangles = run.body_mesh(body)
+        mesh = UsdGeom.Mesh.Define(stage, f"/Run/{_identifier(name, body)}")
+        mesh.GetPrim().SetMetadata("comment", name)
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles.ravel(), dtype=np.int32)))
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateDoubleSidedAttr(kind == "cloth")
+        color = OBSTACLE if kind == "obstacle" else PALETTE[body % len(PALETTE)]
+        linear = [(int(color[k : k + 2], 16) / 255.0) ** 2.2 for k in (1, 3, 5)]
+        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear)])
+        meshes.append((vertices, mesh.CreatePointsAttr(), mesh.CreateExtentAttr()))
+    for frame in range(run.frame_count):
+        positions = run.positions(frame).astype(np.float32)
+        for vertices, points, extent in meshes:
+            own = np.ascontiguousarray(positions[vertices])
+            points.Set(Vt.Vec3fArray.FromNumpy(own), frame)
+            extent.Set(Vt.Vec3fArray.FromNumpy(np.array([own.min(axis=0), own.max(axis=0)])), frame)
+    stage.GetRootLayer().Save()
+    return path
+
+
+def _identifier(name: str, body: int) -> str:
+    """A USD name: letters, digits and _; the body's number keeps names apart."""
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in f"b{body}_{name}")
