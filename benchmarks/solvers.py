@@ -60,7 +60,7 @@ def machine() -> str:
 def cases(size: int) -> dict[str, tuple[np.ndarray, sp.csr_matrix]]:
     """Systems of about `size` vertices: which of them are free, and the matrix."""
     cloth = systems.cloth_grid(round(size**0.5))
-    block = systems.tet_grid(round(size ** (1 / 3)) - 1)
+    block = systems.tet_grid(round(size ** (1 / 3)) - 1, jitter=0.3)
     return {
         "soft cloth": (cloth[0][:, 0] > 0.0, systems.cloth_matrix(*cloth, young=1e4)),
         "stiff cloth": (cloth[0][:, 0] > 0.0, systems.cloth_matrix(*cloth, young=1e6)),

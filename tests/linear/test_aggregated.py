@@ -158,7 +158,7 @@ def test_refusals():
     system, start, b, contact, _ = case("regular tets", "coupled", 0.1, DEVICE, PRECISION)
     with pytest.raises(ValueError, match="scalar contacts only"):
         solve(make_solver("a-jacobi", system), start, b, contact)
-    with pytest.raises(ValueError, match="A-products of order 2 need"):
+    with pytest.raises(ValueError, match="A-products of order 3 need"):
         make_solver("a-jacobi", system, order=3, memory_limit=1e6)
     with pytest.raises(ValueError, match='polynomial is "taylor"'):
         make_solver("a-jacobi", system, polynomial="taylor")

@@ -220,7 +220,7 @@ class AJacobi(Solver):
             if 3 * (largest + 1) * self.real.numpy.itemsize <= 48 * 1024 or size == 1:
                 break
             size = max(1, size // 2)
-        self.capacity = 1 << (largest - 1).bit_length() if not self.device.is_cuda else largest
+        self.capacity = largest if self.device.is_cuda else max(1024, 1 << (largest - 1).bit_length())
         self.groups = len(starts) - 1
         owner = np.repeat(np.arange(self.groups), np.diff(starts))
         key = owner.astype(np.int64) * system.count + vertices

@@ -28,6 +28,7 @@ _SWEEPS = """
     __shared__ SCALAR first_buffer[3 * CAPACITY + 1], second_buffer[3 * CAPACITY + 1];
 #else
 #define SYNC
+    typedef SCALAR four __attribute__((vector_size(4 * sizeof(SCALAR)), aligned(sizeof(SCALAR))));  // as in rows.py
     SCALAR first_buffer[3 * CAPACITY + 1], second_buffer[3 * CAPACITY + 1];
 #endif
     SCALAR* now = first_buffer;
@@ -35,6 +36,9 @@ _SWEEPS = """
     const int base = starts.data[group];
     const int count = starts.data[group + 1] - base;
     const int* vertex = vertices.data + base;
+    const int* first_entry = offsets.data + row_starts.data[group];
+    const int* column = columns.data;
+    const SCALAR* value = values.data;
     for (int k = lane; k < count; k += lanes) {
         for (int c = 0; c < 3; ++c) {
             now[3 * k + c] = x.data[vertex[k]].c[c];
@@ -52,13 +56,23 @@ _SWEEPS = """
             const SCALAR factor = inverse.data[v];
             if (factor == 0) { continue; }
             SCALAR r[3], u[3];
-            for (int c = 0; c < 3; ++c) { r[c] = b.data[v].c[c] - diagonal.data[v] * now[3 * k + c]; }
-            const int high = offsets.data[row_starts.data[group] + k + 1];
-            for (int e = offsets.data[row_starts.data[group] + k]; e < high; ++e) {
-                const SCALAR value = values.data[e];
-                const SCALAR* other = now + 3 * columns.data[e];
-                r[0] -= value * other[0]; r[1] -= value * other[1]; r[2] -= value * other[2];
+            const int low = first_entry[k], high = first_entry[k + 1];
+#if defined(__CUDA_ARCH__)
+            SCALAR sum[3] = {0, 0, 0};
+            for (int e = low; e < high; ++e) {
+                for (int c = 0; c < 3; ++c) { sum[c] += value[e] * now[3 * column[e] + c]; }
             }
+#else
+            four sum = {0, 0, 0, 0}, odd = {0, 0, 0, 0};
+            int e = low;
+            for (; e + 1 < high; e += 2) {
+                sum += value[e] * *(const four*)(now + 3 * column[e]);
+                odd += value[e + 1] * *(const four*)(now + 3 * column[e + 1]);
+            }
+            if (e < high) { sum += value[e] * *(const four*)(now + 3 * column[e]); }
+            sum += odd;
+#endif
+            for (int c = 0; c < 3; ++c) { r[c] = b.data[v].c[c] - diagonal.data[v] * now[3 * k + c] - sum[c]; }
             for (int c = 0; c < 3; ++c) {
                 u[c] = factor * r[c];
                 if (factor < 0) {
@@ -122,7 +136,7 @@ class MatrixPowers(jacobi.Chebyshev):
             if fits is None or largest <= fits or size == 1:
                 break
             size = max(1, size // 2)
-        self.capacity = fits if fits is not None else 1 << (largest - 1).bit_length()
+        self.capacity = fits if fits is not None else max(1024, 1 << (largest - 1).bit_length())
         self.groups = len(starts) - 1
         owner = np.repeat(np.arange(self.groups), np.diff(starts))
         updated = np.zeros((self.groups, order), dtype=np.int32)
