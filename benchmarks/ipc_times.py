@@ -3,7 +3,7 @@
     python benchmarks/ipc_times.py [SCENE ...] [--steps N]
 
 Scenes: block10 (a soft block of 10^3 cells dropped on a floor), three (three spheres falling into a box), armadillo_9k and
-armadillo_55k (flattened between two boards; of the optional test data). One line a step; medians in the file.
+armadillo_55k (flattened between two boards; of the optional test data). One line a step; medians in the file, with the machine's load.
 """
 
 import argparse
@@ -126,7 +126,7 @@ SCENES = {
 def run(name: str, steps: int) -> dict:
     """Runs a scene; returns its numbers."""
     made, state, size, targets = SCENES[name]()
-    infos, contacts = [], []
+    infos, contacts, load = [], [], []
     for k in range(steps):
         target = None if targets is None else targets((k + 1) * H)
         state, info = ipc.step(made, state, targets=target, tolerance=TOLERANCE * size)
@@ -134,6 +134,7 @@ def run(name: str, steps: int) -> dict:
             sys.exit(f"{name}: step {k} intersects")
         contacts.append(len(made.contact.pairs(state.positions).quads))
         infos.append(info)
+        load.append(os.getloadavg()[0])
         print(
             f"{name} {k + 1}/{steps}: {info.seconds:.2f} s (solver {info.solve_seconds:.2f} s), {info.iterations} iterations, "
             f"{contacts[-1]} barriers, gap {info.smallest_gap:.2e} m, lag {info.lag:.1e} m, converged {info.converged}",
@@ -153,6 +154,7 @@ def run(name: str, steps: int) -> dict:
         "unconverged_steps": sum(not info.converged for info in infos),
         "largest_lag_m": max(info.lag for info in infos),
         "intersections": 0,
+        "load_average": statistics.fmean(load),  # above the number of cores, other work slowed this down
     }
 
 

@@ -130,11 +130,12 @@ def _unit_product(s: np.ndarray):
         up = (excess > 0) != smaller
         low, high = np.where(up, y, low), np.where(up, high, y)
         newton = y - excess / np.where(slope == 0, np.inf, slope)
-        fast = (newton > low) & (newton < high) & (np.abs(newton - y) < 0.5 * np.abs(before))
-        following = np.where(fast, newton, 0.5 * (low + high))
-        before, y = following - y, following
-        if (np.abs(before) <= 1e-15 * (1 + np.abs(y))).all():
+        settled = np.abs(newton - y) <= 1e-15 * (1 + np.abs(y))
+        if settled.all():
             break
+        fast = (newton > low) & (newton < high) & (np.abs(newton - y) < 0.5 * np.abs(before))
+        following = np.where(settled, y, np.where(fast, newton, 0.5 * (low + high)))
+        before, y = following - y, following
     p = roots(y, smaller)[0]
     # differentiate p_i - s_i + y / p_i = 0 and sum log p_i = 0
     r = s.shape[1]
@@ -172,6 +173,7 @@ class Length:
         """P; and dP/dF, which scales what is across F by L / |F|."""
         size = np.maximum(np.linalg.norm(f[:, :, 0], axis=1), SMALLEST)
         n = f[:, :, 0] / size[:, None]
+        n[size == SMALLEST] = (1.0, 0.0, 0.0)
         helper = np.eye(3)[np.argmin(np.abs(n), axis=1)]
         a = np.cross(n, helper)
         a /= np.linalg.norm(a, axis=1)[:, None]

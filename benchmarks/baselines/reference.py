@@ -60,7 +60,9 @@ class Reference:
         acceleration = model.external.accelerations(self.time, self.state.positions, self.state.velocities)
         self.time += self.problem.time_step
         soft = [pin for pin in a.pins if pin.stiffness is not None and len(pin.vertices)]
-        held = [t.manifold for s, t in zip(model.projector.sets, self.problem.terms, strict=True) if s.kind == "point_attachment"]
+        held = [
+            t.manifold for s, t in zip(model.projector.sets, self.problem.terms, strict=True) if s.kind == "point_attachment"
+        ]
         for pin, manifold in zip(soft, held, strict=True):
             manifold.values = a.pin_targets(pin, self.time)[:, :, None]
         targets = model.kinematic_targets(self.time)
