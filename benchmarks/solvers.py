@@ -39,7 +39,7 @@ OURS = {
     "two-level": {},
     "chebyshev": {},
     "a-jacobi": {"order": 2},
-    "a-jacobi l=3": {"order": 3, "polynomial": "chebyshev"},
+    "a-jacobi l=3": {"order": 3, "polynomial": "chebyshev", "memory_limit": 2**30},
     "matrix-powers": {"order": 2},
     "jacobi": {},
     "gauss-seidel": {},

@@ -106,14 +106,15 @@ class AProducts:
             exact = np.repeat(exact, count) * b.data[edge]
             found.append((head, tail, between, coefficients[k] * (value + with_bend), coefficients[k] * exact))
         head, tail, between, product, exact = (np.concatenate(part) for part in zip(*found, strict=True))
-        scale = np.append(inverse, 1.0)
-        factor = np.where(np.arange(len(head)) < len(start), 1.0, scale[head]) * np.prod(scale[between], axis=1)
-        size = np.abs(product * factor)
-        largest = np.zeros(n)
-        np.maximum.at(largest, head, size)
-        keep = (product != 0.0) & (size >= drop * largest[head])
-        lost = np.bincount(head, np.where(keep, np.abs(exact - product), np.abs(exact)) * factor, n)
-        self.dropped = float(np.max(lost / np.maximum(np.bincount(head, np.abs(exact) * factor, n), 1e-300)))
+        keep, self.dropped = product != 0.0, 0.0
+        if split is not None or drop > 0.0:
+            scale = np.append(inverse, 1.0)
+            factor = np.where(np.arange(len(head)) < len(start), 1.0, scale[head]) * np.prod(scale[between], axis=1)
+            size, largest = np.abs(product * factor), np.zeros(n)
+            np.maximum.at(largest, head, size)
+            keep &= size >= drop * largest[head]
+            lost = np.bincount(head, np.where(keep, np.abs(exact - product), np.abs(exact)) * factor, n)
+            self.dropped = float(np.max(lost / np.maximum(np.bincount(head, np.abs(exact) * factor, n), 1e-300)))
         path = np.flatnonzero(keep)[np.argsort(head[keep].astype(np.int64) * n + tail[keep], kind="stable")]
         key = head[path].astype(np.int64) * n + tail[path]
         first = np.flatnonzero(np.diff(key, prepend=-1))
