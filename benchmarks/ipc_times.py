@@ -3,7 +3,8 @@
     python benchmarks/ipc_times.py [SCENE ...] [--steps N]
 
 Scenes: block10 (a soft block of 10^3 cells dropped on a floor), three (three spheres falling into a box), armadillo_9k and
-armadillo_55k (flattened between two boards; of the optional test data). One line a step; medians in the file, with the machine's load.
+armadillo_55k (flattened between two boards; of the optional test data). One line a step; medians in the file, with the
+machine's load.
 """
 
 import argparse
