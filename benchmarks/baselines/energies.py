@@ -354,4 +354,4 @@ def bending(rest: np.ndarray, triangles: np.ndarray, stiffness: float, curved: b
     areas = triangle_areas(rest, stencil[:, [0, 1, 2]]) + triangle_areas(rest, stencil[:, [0, 1, 3]])
     bent = np.linalg.norm(np.einsum("ks,ksi->ki", row, x), axis=1)
     manifold = Length(bent) if curved else Fixed(np.zeros((len(stencil), 3, 1)))
-    return Term(stencil, row[:, None, :], 3 * stiffness / areas, manifold)
+    return Term(stencil, row[:, None, :], stiffness / areas, manifold)

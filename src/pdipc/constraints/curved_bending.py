@@ -24,7 +24,7 @@ def rest(rest_positions: np.ndarray, triangles: np.ndarray, bending_stiffness: f
     vertices = hinges(triangles)
     g, area = curvature_rows(rest_positions, vertices)
     length = np.linalg.norm(np.einsum("hc,hcd->hd", g, rest_positions[vertices]), axis=1)
-    return make_set(NAME, vertices, g[:, None, :], 3.0 * bending_stiffness / area, length=length)
+    return make_set(NAME, vertices, g[:, None, :], bending_stiffness / area, length=length)
 
 
 def functions(real: Real) -> SimpleNamespace:

@@ -1,7 +1,7 @@
 """Engineering values to weights: the one place where Pa and N/m become the w of Eq. (2).
 
-Solids. For small strains e, w V |F - R|^2 / 2 is w V e:e / 2, and w V |F - P|^2 / 2 with det P = 1 is w V tr(e)^2 / 6. Hooke has
-V (mu e:e + lambda tr(e)^2 / 2). So tet_strain has w = 2 mu and tet_volume w = 3 lambda: together they are Hooke's law.
+Solids. For small strains e, w V |F - R|^2 / 2 is w V e:e / 2, and w V |F - P|^2 / 2 with det P = 1 is w V tr(e)^2 / 6. Hooke's
+law has the energy V (mu e:e + lambda tr(e)^2 / 2). So tet_strain has w = 2 mu and tet_volume has w = 3 lambda.
 
 Cloth, in plane stress with Y = E t in N/m: triangle_strain has w = 2 mu', mu' = Y / (2 (1 + nu)), and triangle_area, where
 |F - P|^2 is tr(e)^2 / 2, has w = 2 lambda', lambda' = Y nu / (1 - nu^2).

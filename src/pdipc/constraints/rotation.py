@@ -18,7 +18,7 @@ import warp as wp
 
 from pdipc.precision import Real
 
-NEWTON_STEPS = 12  # at most; three or four are usual
+NEWTON_STEPS = 16  # at most; three or four are usual
 DEGENERATE = {"float32": 2.0e-2, "float64": 1.0e-4}  # of |F|^3: below, an SVD takes over
 
 
@@ -26,7 +26,8 @@ DEGENERATE = {"float32": 2.0e-2, "float64": 1.0e-4}  # of |F|^3: below, an SVD t
 def functions(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     degenerate = wp.constant(scalar(DEGENERATE[real.name]))
-    settled = wp.constant(scalar(4.0 * real.unit_roundoff))
+    one, zero = wp.constant(scalar(1.0)), wp.constant(scalar(0.0))
+    settled = wp.constant(scalar(8.0 * real.unit_roundoff))
 
     @wp.func
     def cofactor(f: mat33) -> mat33:
@@ -70,23 +71,29 @@ def functions(real: Real) -> SimpleNamespace:
         if not (size_sq > scalar(0.0)):
             largest = wp.max(wp.max(wp.abs(f[0, 0]), wp.abs(f[1, 1])), wp.abs(f[2, 2]))
             if not (largest > scalar(0.0)):
-                return wp.identity(n=3, dtype=scalar)
+                return mat33(
+                    one, zero, zero,
+                    zero, one, zero,
+                    zero, zero, one,
+                )  # fmt: skip
         g = f / wp.sqrt(size_sq)  # |g| = 1
         c = cofactor(g)
         d = g[0, 0] * c[0, 0] + g[1, 0] * c[1, 0] + g[2, 0] * c[2, 0]
         m = wp.ddot(c, c)
         i1 = scalar(1.7320508075688772)
         # p(i1) = (i1^2 - 1)^2 - 4 m - 8 d i1 is convex and increasing from its largest root on
-        for _ in range(NEWTON_STEPS):
+        settled_at = int(0)
+        for k in range(NEWTON_STEPS):
             q = i1 * i1 - scalar(1.0)
             slope = scalar(4.0) * (i1 * q - scalar(2.0) * d)
             step = (q * q - scalar(4.0) * m - scalar(8.0) * d * i1) / wp.max(slope, scalar(1.0e-30))
             i1 -= step
             if wp.abs(step) <= settled:
+                settled_at = k + 1
                 break
         i2 = scalar(0.5) * (i1 * i1 - scalar(1.0))
         divisor = i1 * i2 - d
-        if not (divisor > degenerate):
+        if settled_at == 0 or not (divisor > degenerate):
             return rotation_by_svd(g)
         r = (i1 * c + (i1 * i1 - i2) * g - g * (wp.transpose(g) * g)) / divisor
         return orthonormalized(r)

@@ -1,0 +1,255 @@
+"""Every kind of constraint: rest, rigid motion, gradient, optimal projection, the constant matrix, the gather."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from pdipc import constraints
+from pdipc.constraints import (
+    curved_bending,
+    edge_length,
+    material,
+    point_attachment,
+    quadratic_bending,
+    tet_strain,
+    tet_volume,
+    triangle_area,
+    triangle_strain,
+)
+from pdipc.parallel import Device
+from pdipc.precision import real
+
+DEVICE = Device("cpu", threads=1)
+REST_ENERGY = 1e-18  # J, of elements with weights of about one
+GRADIENT = 1e-6  # relative, central differences in float64
+
+
+def tet_mesh(rng):
+    """Two tets that share a face."""
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.0]]) + 0.1 * rng.standard_normal((5, 3))
+    return x, np.array([[0, 1, 2, 3], [1, 2, 3, 4]], dtype=np.int32)
+
+
+def sheet(rng, height=0.0):
+    """A 4 x 4 grid of vertices in the plane z = 0, or on a saddle."""
+    i, j = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
+    x = np.stack([i, j, height * (i - 1.5) * (j - 1.5)], axis=-1).reshape(-1, 3).astype(float)
+    quads = [(a * 4 + b, (a + 1) * 4 + b, (a + 1) * 4 + b + 1, a * 4 + b + 1) for a in range(3) for b in range(3)]
+    triangles = np.array([t for q in quads for t in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))], dtype=np.int32)
+    return x, triangles
+
+
+def make(kind, rng):
+    """Rest positions and a set of the kind."""
+    if kind in (tet_strain, tet_volume):
+        x, tets = tet_mesh(rng)
+        return x, kind.rest(x, tets, 2.0)
+    if kind is point_attachment:
+        x = rng.standard_normal((4, 3))
+        return x, kind.rest(x[:3], np.arange(3), 2.0)
+    x, triangles = sheet(rng, height=0.2 if kind is curved_bending else 0.0)
+    if kind is edge_length:
+        return x, kind.rest(x, triangles[:, :2], 2.0)
+    return x, kind.rest(x, triangles, 2.0)
+
+
+def energy(x, s, precision="float64"):
+    number = real(precision)
+    projector = constraints.Projector(DEVICE, number, len(x), [s])
+    out = wp.zeros(1, dtype=number.scalar, device="cpu")
+    projector.energy(wp.array(x, dtype=number.vec3, device="cpu"), out, 0)
+    return float(out.numpy()[0])
+
+
+def forces(x, sets, precision="float64", threads=1):
+    number, device = real(precision), Device("cpu", threads=threads)
+    projector = constraints.Projector(device, number, len(x), sets)
+    base, out = (wp.zeros(len(x), dtype=number.vec3, device="cpu") for _ in range(2))
+    projector.add_forces(wp.array(x, dtype=number.vec3, device="cpu"), out, base)
+    return out.numpy()
+
+
+def rotation(rng):
+    q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+@pytest.mark.parametrize("kind", constraints.KINDS, ids=lambda kind: kind.NAME)
+def test_energy_is_zero_at_rest_and_under_rigid_motion(kind):
+    rng = np.random.default_rng(1)
+    x, s = make(kind, rng)
+    assert energy(x, s) < REST_ENERGY
+    if kind is not point_attachment:
+        assert energy(x @ rotation(rng).T + rng.standard_normal(3), s) < REST_ENERGY * 1e6
+
+
+@pytest.mark.parametrize("kind", constraints.KINDS, ids=lambda kind: kind.NAME)
+def test_forces_are_the_negative_gradient_of_the_energy(kind):
+    rng = np.random.default_rng(2)
+    x, s = make(kind, rng)
+    x = x + 0.1 * rng.standard_normal(x.shape)
+    step, direction = 1e-5, rng.standard_normal(x.shape)
+    slope = (energy(x + step * direction, s) - energy(x - step * direction, s)) / (2 * step)
+    work = -(forces(x, [s]) * direction).sum()
+    assert work == pytest.approx(slope, rel=GRADIENT, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", constraints.KINDS, ids=lambda kind: kind.NAME)
+def test_matrix_minus_targets_is_the_force(kind):
+    """A x of the constant matrix less w G^T p is minus the force: for the kinds whose target is zero, A x alone is."""
+    rng = np.random.default_rng(3)
+    x, s = make(kind, rng)
+    matrix = constraints.stiffness_matrix(len(x), [s])
+    assert abs(matrix - matrix.T).max() < 1e-12
+    dense = np.zeros((len(x), len(x)))
+    for e in range(len(s)):
+        dense[np.ix_(s.vertices[e], s.vertices[e])] += s.weight[e] * s.gradient[e].T @ s.gradient[e]
+    np.testing.assert_allclose(matrix.toarray(), dense, atol=1e-12)
+    if kind is quadratic_bending:
+        x = x + rng.standard_normal(x.shape)
+        np.testing.assert_allclose(forces(x, [s]), -dense @ x, atol=1e-9)
+
+
+def test_strain_projects_to_the_nearest_rotation():
+    """Against NumPy's SVD on near-rotations, stretched, inverted, flat, rank-one and zero matrices."""
+    rng = np.random.default_rng(4)
+    project = tet_strain.functions(real("float64")).project
+    cases = [rng.standard_normal((3, 3)) for _ in range(200)]
+    cases += [
+        rotation(rng) @ np.diag([1, 1, -1.0]),
+        np.diag([1, 1, 0.0]),
+        np.diag([2.0, 0, 0]),
+        1e-9 * np.eye(3),
+        1e9 * np.eye(3),
+    ]
+    cases += [rotation(rng) * scale + 1e-3 * scale * rng.standard_normal((3, 3)) for scale in (1e-6, 1.0, 1e6)]
+    for f in cases:
+        p = np.array(project(wp.mat33d(*f.ravel()))).reshape(3, 3)
+        np.testing.assert_allclose(p.T @ p, np.eye(3), atol=1e-12)
+        assert np.linalg.det(p) > 0
+        u, s, vt = np.linalg.svd(f)
+        s = s * [1, 1, np.sign(np.linalg.det(u @ vt))]
+        best = (f**2).sum() - 2 * s.sum() + 3
+        assert ((f - p) ** 2).sum() <= best + 1e-10 * max(1.0, (f**2).sum())
+    identity = np.array(project(wp.mat33d())).reshape(3, 3)
+    np.testing.assert_allclose(identity, np.eye(3))
+
+
+def test_rotation_in_float32_is_as_good_as_float32_allows():
+    rng = np.random.default_rng(5)
+    project = tet_strain.functions(real("float32")).project
+    for _ in range(200):
+        f = rng.standard_normal((3, 3)).astype(np.float32)
+        p = np.array(project(wp.mat33(*f.ravel()))).reshape(3, 3)
+        u, s, vt = np.linalg.svd(f.astype(np.float64))
+        s = s * [1, 1, np.sign(np.linalg.det(u @ vt))]
+        best = (f.astype(np.float64) ** 2).sum() - 2 * s.sum() + 3
+        assert ((f - p) ** 2).sum() <= best + 1e-4 * (1 + abs(best))
+        np.testing.assert_allclose(p.T @ p, np.eye(3), atol=1e-5)
+
+
+def test_volume_projection_is_nearest_among_its_neighbours():
+    """No matrix of determinant one around the projection is nearer: moves along the manifold do not get closer."""
+    rng = np.random.default_rng(6)
+    project = tet_volume.functions(real("float64")).project
+    for _ in range(50):
+        f = np.eye(3) + 0.3 * rng.standard_normal((3, 3))
+        p = np.array(project(wp.mat33d(*f.ravel()))).reshape(3, 3)
+        assert np.linalg.det(p) == pytest.approx(1.0, abs=1e-9)
+        for _ in range(20):
+            q = p + 1e-3 * rng.standard_normal((3, 3))
+            q /= np.cbrt(np.linalg.det(q))
+            assert ((f - q) ** 2).sum() >= ((f - p) ** 2).sum() - 1e-9
+
+
+def columns(p):
+    return np.array(p).reshape(2, 3).T
+
+
+def test_triangle_projections_are_nearest():
+    """Isometry: against the SVD. Area: determinant one, and no neighbour of area one in the plane is nearer."""
+    rng = np.random.default_rng(7)
+    isometry = triangle_strain.functions(real("float64")).project
+    area = triangle_area.functions(real("float64")).project
+    for _ in range(100):
+        f = rng.standard_normal((3, 2))
+        p = columns(isometry(wp.vec3d(*f[:, 0]), wp.vec3d(*f[:, 1])))
+        u, _, vt = np.linalg.svd(f, full_matrices=False)
+        np.testing.assert_allclose(p, u @ vt, atol=1e-10)
+        f = u @ np.diag(1 + 0.3 * rng.standard_normal(2)) @ vt
+        q = columns(area(wp.vec3d(*f[:, 0]), wp.vec3d(*f[:, 1])))
+        assert np.linalg.norm(np.cross(q[:, 0], q[:, 1])) == pytest.approx(1.0, abs=1e-9)
+        for _ in range(10):
+            near = q @ (np.eye(2) + 1e-3 * rng.standard_normal((2, 2)))
+            near /= np.sqrt(np.linalg.norm(np.cross(near[:, 0], near[:, 1])))
+            assert ((f - near) ** 2).sum() >= ((f - q) ** 2).sum() - 1e-9
+    for f in (np.zeros((3, 2)), np.array([[1.0, 2.0], [0, 0], [0, 0]])):
+        p = columns(isometry(wp.vec3d(*f[:, 0]), wp.vec3d(*f[:, 1])))
+        np.testing.assert_allclose(p.T @ p, np.eye(2), atol=1e-12)
+
+
+def test_gather_has_the_same_bits_for_any_number_of_threads():
+    rng = np.random.default_rng(8)
+    i = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    x = i + 0.1 * rng.standard_normal(i.shape)
+    corner = i[(i < 15).all(axis=1)] @ [256, 16, 1]
+    tets = np.stack([corner, corner + 256, corner + 16, corner + 1], axis=1).astype(np.int32)
+    sets = [tet_strain.rest(i.astype(float), tets, 1.0), edge_length.rest(i.astype(float), tets[:, :2], 3.0)]
+    for precision in ("float64", "float32"):
+        one = forces(x, sets, precision, threads=1)
+        for threads in (2, 3):
+            np.testing.assert_array_equal(forces(x, sets, precision, threads), one)
+    np.testing.assert_allclose(forces(x, sets, "float32"), forces(x, sets), atol=2e-5)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45])
+def test_small_strains_follow_hookes_law(poisson):
+    """Energy of a uniaxial strain, with free contraction, is E e^2 V / 2; of a pure volume change, K tr^2 V / 2."""
+    rng = np.random.default_rng(9)
+    x, tets = tet_mesh(rng)
+    young, strain = 3.0, 1e-4
+    w_strain, w_volume = material.solid(young, poisson)
+    sets = [tet_strain.rest(x, tets, w_strain), tet_volume.rest(x, tets, w_volume)]
+    volume = tet_volume.rest(x, tets, 1.0).weight.sum()
+    stretched = x * (1 + strain * np.array([1, -poisson, -poisson]))
+    assert sum(energy(stretched, s) for s in sets) == pytest.approx(0.5 * young * strain**2 * volume, rel=1e-3)
+    bulk = young / (3 * (1 - 2 * poisson))
+    grown = x * (1 + strain / 3)
+    assert sum(energy(grown, s) for s in sets) == pytest.approx(0.5 * bulk * strain**2 * volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3])
+def test_small_membrane_strains_follow_plane_stress(poisson):
+    x, triangles = sheet(np.random.default_rng(10))
+    stiffness, strain = 7.0, 1e-4
+    w_strain, w_area = material.cloth(stiffness, poisson)
+    sets = [triangle_strain.rest(x, triangles, w_strain), triangle_area.rest(x, triangles, w_area)]
+    stretched = x * (1 + strain * np.array([1, -poisson, 0]))
+    assert sum(energy(stretched, s) for s in sets) == pytest.approx(0.5 * stiffness * strain**2 * 9.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("degrees", [0, 20, 45, 90])
+def test_bending_energy_of_a_cylinder(degrees):
+    """Equilateral triangles rolled to radius r, in any direction, have the energy k / (2 r^2) per area."""
+    n, radius, rigidity = 41, 40.0, 0.5
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    flat = np.stack([i + 0.5 * j, np.sqrt(0.75) * j, 0 * i], axis=-1).reshape(-1, 3)
+    c = (i[:-1, :-1] * n + j[:-1, :-1]).ravel()
+    triangles = np.concatenate([np.stack([c, c + n, c + 1], 1), np.stack([c + n, c + n + 1, c + 1], 1)]).astype(np.int32)
+    s = quadratic_bending.rest(flat, triangles, rigidity)
+    along = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0])
+    across = np.array([-along[1], along[0], 0])
+    u, v = flat @ along, flat @ across
+    rolled = np.stack([radius * np.sin(u / radius), v, radius * (1 - np.cos(u / radius))], axis=1)
+    area = np.sqrt(0.75) * (n - 1) ** 2
+    assert energy(rolled, s) == pytest.approx(0.5 * rigidity * area / radius**2, rel=0.05)
+
+
+def test_bad_rest_shapes_are_refused_by_name():
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    with pytest.raises(ValueError, match=r"tet 0 .* has the volume -0\.16"):
+        tet_strain.rest(x, np.array([[0, 2, 1, 3]]), 1.0)
+    with pytest.raises(ValueError, match=r"triangle 0 .* has the area 0"):
+        triangle_strain.rest(x, np.array([[0, 1, 1]]), 1.0)
+    with pytest.raises(ValueError, match="weight is nan"):
+        tet_strain.rest(x, np.array([[0, 1, 2, 3]]), np.nan)
