@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from .scenes import floor, scene, solid, watched
 
 G = 9.81

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pdipc.audit import contact_forces
+
 from .scenes import cloth, floor, scene, solid, watched
 
 G = 9.81
