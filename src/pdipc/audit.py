@@ -33,7 +33,7 @@ class Audit:
 def _freeze(model: Model, state: State, work: Work) -> None:
     if not work.candidates.covers(state.positions):
         work.candidates.cover(state.positions, state.positions, model.settings.margin)
-    work.pairs.freeze(work.candidates, state.positions, state.positions)
+    work.pairs.freeze(work.candidates, state.positions)
 
 
 def audit(model: Model, state: State, work: Work) -> Audit:

@@ -227,7 +227,7 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
         if not (candidates.covers(work.x) and candidates.covers(work.x_tilde)):
             candidates.cover(work.x, work.x_tilde, margin)
             clock.mark("ccd")
-        smallest = pairs.freeze(candidates, work.x, work.x_start)  # line 5
+        smallest = pairs.freeze(candidates, work.x)  # line 5
         clock.mark("barrier")
         work.inner_loop(model)  # lines 7 to 12
         clock.mark("solver")

@@ -1,12 +1,16 @@
 """Active pairs: the barriers of one outer iteration, and what the inner loop needs of them (Algorithm 1, line 5).
 
-At the feasible x of an outer iteration the pairs nearer than d_hat are listed and their witness weights a, normal n, gap d0,
-stiffness and friction weight are frozen. In the inner loop a pair's gap is linear in the iterate x~:
+At the feasible x of an outer iteration the pairs nearer than d_hat are listed and their witness weights a, normal n, gap d0 and
+stiffness are frozen. In the inner loop a pair's gap is linear in the iterate x~:
 
     delta = d0 + n . sum_i a_i (x~_i - x_i),    force on vertex i: -f a_i n,    f = kappa m b'(delta)
 
 with b' extended linearly below gamma d0, since the iterate may pass through before it is truncated. This departs from Eq. (6):
 a position target cannot carry a force that grows without bound (docs/paper_map.md).
+
+Friction is Coulomb's, smoothed as in IPC: mu lambda f1(|u|) / |u| times the slip u since the start of the step, with the normal
+force lambda = -f and u of the iterate, as a spring that is renewed with every local-global iteration. Lagging it over an outer
+iteration does not work here: after a truncation the frozen gap, and so lambda, is far from equilibrium, and states limit-cycle.
 """
 
 import functools
@@ -81,7 +85,6 @@ def kernels(real: Real) -> SimpleNamespace:
         def kernel(
             first: int,
             x: wp.array(dtype=vec3),
-            x_start: wp.array(dtype=vec3),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
             count: int,
@@ -91,14 +94,13 @@ def kernels(real: Real) -> SimpleNamespace:
             kappa: wp.array(dtype=scalar),
             friction: wp.array(dtype=scalar),
             free: wp.array(dtype=scalar),
-            slip_threshold: scalar,
             quads_out: wp.array(dtype=wp.vec4i),
             weights_out: wp.array(dtype=vec4),
             normals_out: wp.array(dtype=vec3),
             gaps_out: wp.array(dtype=scalar),
             activation_out: wp.array(dtype=scalar),
             stiffness_out: wp.array(dtype=scalar),
-            friction_out: wp.array(dtype=scalar),
+            coefficient_out: wp.array(dtype=scalar),
             share_out: wp.array(dtype=scalar),
         ):
             b = first + wp.tid()
@@ -130,18 +132,13 @@ def kernels(real: Real) -> SimpleNamespace:
                     stiffness = m * scalar(0.5) * (ka + kb)
                     if ka == scalar(0.0) or kb == scalar(0.0):
                         stiffness = m * (ka + kb)
-                    u = a[0] * (x[q[0]] - x_start[q[0]]) + a[1] * (x[q[1]] - x_start[q[1]])
-                    u += a[2] * (x[q[2]] - x_start[q[2]]) + a[3] * (x[q[3]] - x_start[q[3]])
-                    u -= wp.dot(u, n) * n
-                    pressure = -stiffness * bar.barrier_gradient(d0, d_hat)
-                    mu = wp.sqrt(friction[q[0]] * friction[q[3]])
                     quads_out[slot] = q
                     weights_out[slot] = a
                     normals_out[slot] = n
                     gaps_out[slot] = d0
                     activation_out[slot] = d_hat
                     stiffness_out[slot] = stiffness
-                    friction_out[slot] = mu * pressure * bar.smoothed_coulomb(wp.length(u), slip_threshold)
+                    coefficient_out[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
                     share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
                     share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
                     slot += 1
@@ -207,7 +204,9 @@ def kernels(real: Real) -> SimpleNamespace:
         gaps: wp.array(dtype=scalar),
         activation: wp.array(dtype=scalar),
         stiffness: wp.array(dtype=scalar),
-        friction: wp.array(dtype=scalar),
+        coefficient: wp.array(dtype=scalar),
+        slip_threshold: scalar,
+        friction_out: wp.array(dtype=scalar),
         hessian_out: wp.array(dtype=scalar),
         force_out: wp.array(dtype=vec3),
     ):
@@ -225,10 +224,14 @@ def kernels(real: Real) -> SimpleNamespace:
                 f = stiffness[k] * bar.extended_gradient(delta, floor, activation[k])
                 # `force` is what the pair exerts, per unit of witness weight: barrier along n, friction across
                 force = -f * n
-                if friction[k] > scalar(0.0):
+                friction = scalar(0.0)
+                if coefficient[k] > scalar(0.0):
                     u = a[0] * (x_tilde[q[0]] - x_start[q[0]]) + a[1] * (x_tilde[q[1]] - x_start[q[1]])
                     u += a[2] * (x_tilde[q[2]] - x_start[q[2]]) + a[3] * (x_tilde[q[3]] - x_start[q[3]])
-                    force -= friction[k] * (u - wp.dot(u, n) * n)
+                    u -= wp.dot(u, n) * n
+                    friction = -coefficient[k] * f * bar.smoothed_coulomb(wp.length(u), slip_threshold)
+                    force -= friction * u
+                friction_out[k] = friction
                 force_out[k] = force
 
     @wp.kernel(module=module)
@@ -378,17 +381,15 @@ class ActivePairs:
         self.capacity = capacity
         self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
         self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
-        self.friction, self.share, self.hessian = make(real.scalar), make(real.scalar), make(real.scalar)
+        self.coefficient, self.friction = make(real.scalar), make(real.scalar)
+        self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
 
-    def freeze(self, candidates: Candidates, x: wp.array, x_start: wp.array) -> float:
-        """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Returns the smallest gap d in metres.
-
-        x_start: positions at the start of the step, from which slip is measured.
-        """
+    def freeze(self, candidates: Candidates, x: wp.array) -> float:
+        """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Returns the smallest gap d in metres."""
         k, device = self.kernels, self.device
         totals = {}
         smallest = float("inf")
@@ -417,10 +418,10 @@ class ActivePairs:
             s = self._scratch[kind]
             if totals[kind]:
                 blocks = -(-counts[kind] // BLOCK)
-                inputs = [x, x_start, quads, limits, counts[kind], s.gaps, s.ends, offset]
-                inputs += [self.kappa, self.friction_of_vertex, self.free, self.slip_threshold]
+                inputs = [x, quads, limits, counts[kind], s.gaps, s.ends, offset]
+                inputs += [self.kappa, self.friction_of_vertex, self.free]
                 inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
-                inputs += [self.stiffness, self.friction, self.share]
+                inputs += [self.stiffness, self.coefficient, self.share]
                 device.launch(getattr(k, f"freeze_{kind}"), blocks, inputs, grain=BLOCK)
             offset += totals[kind]
         self.count.fill_(self.number)
@@ -440,12 +441,14 @@ class ActivePairs:
             device.launch(k.sort_incident, n, [self.ends, self.entries])
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:
-        """Forces at the iterate x~ added to rhs, and their Hessian and block diagonal there. Recordable."""
+        """Forces at the iterate x~ added to rhs, and their Hessian and block diagonal there. Recordable.
+
+        x_start: positions at the start of the step, from which slip is measured.
+        """
         k = self.kernels
-        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, self.friction]
-        self.device.launch_list(
-            k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, self.hessian, self.force]
-        )
+        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, self.coefficient]
+        here = [self.slip_threshold, self.friction, self.hessian, self.force]
+        self.device.launch_list(k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, *here])
         inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
         self.device.launch(k.gather, len(self.ends), [*inputs, rhs, self.diagonal])
 
