@@ -1,8 +1,8 @@
 """Judges of CCD answers that share nothing with the code they judge: proofs in float64 with margins, else in fractions.
 
-Both look for a direction n on which the two primitives stay apart at both ends of an interval of time. Vertices move linearly, so
-then they stay apart in between. An interval for which no n is found is halved. `stays_apart` first lets NumPy prove what it can,
-with a margin far above its rounding, and gives the rest to fractions, where nothing rounds.
+Both look for a direction n on which the two primitives stay apart at both ends of an interval of time. Vertices move
+linearly, so then they stay apart in between. An interval for which no n is found is halved. `stays_apart` first lets NumPy
+prove what it can, with a margin far above its rounding, and gives the rest to whole numbers, where nothing rounds.
 """
 
 from fractions import Fraction
@@ -10,6 +10,7 @@ from fractions import Fraction
 import numpy as np
 
 LEVELS = 25  # halvings before fractions take over
+AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, 0, -1))
 MARGIN = 64 * 2.0**-53
 HALVINGS = 60  # of [0, 1], after which fractions give up
 
@@ -23,8 +24,9 @@ def differences(points: np.ndarray, kind: str) -> np.ndarray:
     return pairs.reshape(len(points), 2, 4, 3)
 
 
-def stays_apart(points: np.ndarray, kind: str, times: np.ndarray, separation: float = 0.0) -> np.ndarray:
+def stays_apart(points: np.ndarray, kind: str, times: np.ndarray, separation: float | np.ndarray = 0.0) -> np.ndarray:
     """(n,) whether the distance is proven to stay above `separation` for all t in [0, times]."""
+    separation = np.broadcast_to(np.asarray(separation, dtype=float), len(points))
     points, times = np.asarray(points, dtype=float), np.asarray(times, dtype=float)
     q = differences(points, kind)
     size = np.abs(q).max(axis=(1, 2, 3))
@@ -34,7 +36,7 @@ def stays_apart(points: np.ndarray, kind: str, times: np.ndarray, separation: fl
         proven, hopeless = np.zeros(len(query), dtype=bool), np.zeros(len(query), dtype=bool)
         for chunk in np.array_split(np.arange(len(query)), max(1, len(query) // 50_000)):
             ends = q[query[chunk]]
-            found = _separated(ends, kind, low[chunk], high[chunk], separation, size[query[chunk]])
+            found = _separated(ends, kind, low[chunk], high[chunk], separation[query[chunk]], size[query[chunk]])
             proven[chunk], hopeless[chunk] = found
         open_[query[hopeless]] = True
         keep = ~proven & ~open_[query]
@@ -44,7 +46,7 @@ def stays_apart(points: np.ndarray, kind: str, times: np.ndarray, separation: fl
     open_[query] = True
     result = ~open_
     for i in np.flatnonzero(open_):
-        result[i] = stays_apart_exactly(points[i], kind, times[i], separation) is True
+        result[i] = stays_apart_exactly(points[i], kind, times[i], separation[i]) is True
     return result
 
 
@@ -158,6 +160,11 @@ def distance_squared(points: np.ndarray, kind: str, t: float) -> Fraction:
     return Fraction(_dot(r, r), (m * time.denominator * motion.unit) ** 2)
 
 
+def _separates(n, q, bound_num, bound_den) -> bool:
+    least = min(_dot(n, r) for r in q)
+    return least > 0 and least * least * bound_den > bound_num * _dot(n, n)
+
+
 def stays_apart_exactly(points: np.ndarray, kind: str, time: float, separation: float = 0.0) -> bool | None:
     """Whether the distance of one query stays above `separation` in [0, time]; None where this is not decided."""
     motion, last = ExactMotion(points, kind), Fraction(float(time))
@@ -169,16 +176,11 @@ def stays_apart_exactly(points: np.ndarray, kind: str, time: float, separation: 
         begin, middle, end = motion(2 * low, k + 1), motion(low + high, k + 1), motion(2 * high, k + 1)
         unit_squared = (motion.unit << (k + 1)) ** 2
         bound_num, bound_den = limit.numerator * unit_squared, limit.denominator
-        n, m = nearest(middle, kind)
-        length = _dot(n, n)
-        if length * bound_den <= bound_num * m * m:
+        found = [nearest(q, kind) for q in (middle, begin, end)]
+        if any(_dot(n, n) * bound_den <= bound_num * m * m for n, m in found):
             return False
-        least = min(_dot(n, r) for r in (*begin, *end))
-        if least > 0 and least * least * bound_den > bound_num * length:
+        if any(_separates(n, (*begin, *end), bound_num, bound_den) for n in (*(n for n, _ in found), *AXES)):
             continue
-        for r, m in (nearest(begin, kind), nearest(end, kind)):
-            if _dot(r, r) * bound_den <= bound_num * m * m:
-                return False
         if k - last.denominator.bit_length() > HALVINGS:
             return None
         work += [(low + high, 2 * high, k + 1), (2 * low, low + high, k + 1)]

@@ -1,32 +1,36 @@
 """Conservative continuous collision detection (CCD): times up to which a pair provably keeps its minimum separation.
 
-A pair is two convex sets, a vertex and a triangle or two edges, whose vertices move linearly. q_k(t) = (1 - t) q_k(0) + t q_k(1)
-are the differences x_j - x_i of one vertex of each: three for vertex-triangle, four for edge-edge.
+A pair is two convex sets, a vertex and a triangle or two edges, whose vertices move linearly. The differences x_j - x_i of a
+vertex of each, q_k(t) = (1 - t) q_k(0) + t q_k(1), are all that is needed: three for vertex-triangle, four for edge-edge.
 
-**Lemma 1 (separating direction).** Let n be any vector, |n| = 1. If n . q_k(t) >= g for every k at t = t1 and at t = t2, then
-the distance is at least g at every t in [t1, t2]. Proof: n . q_k is linear in t, so it is at least g in between; any point of one set
-less any point of the other is a convex combination of the q_k, so its projection on n is at least g, and so is its length.
+**Lemma 1 (separating direction).** Let |n| = 1. If n . q_k(t) >= g for every k at t = t1 and at t = t2, the distance is at
+least g at every t in [t1, t2]. Proof: n . q_k is linear in t, so it is at least g in between. A point of one set less a
+point of the other is a convex combination of the q_k, so its projection on n is at least g, and so is its length.
 
-So *any* n gives a valid time, and rounding in the choice of n costs quality, never safety. With the direction between the
-closest points at t the minimum over k of n . q_k(t) is the distance itself, and the first t' at which one n . q_k falls to
-g is at least what an additive CCD step would reach, (d - g) / l_p with l_p = max |q_k'| (Li et al. 2021): n . q_k' >= -l_p. The
-iteration is conservative advancement with directions: choose n at t, go on to t', repeat until the gap is used up.
+So *any* n gives a valid time, and rounding in the choice of n costs quality, never safety. For the direction between the
+closest points at t, the least n . q_k(t) is the distance d itself, and the first time at which one n . q_k falls to g is not
+before that of an additive CCD step (Li et al. 2021), t + (d - g) / l_p with l_p = max |q_k'|, since n . q_k' >= -l_p. The
+iteration is: choose n at t, go on to that time, repeat until the gap is used up. Near-parallel edges, slivers, points in
+place of triangles: all are just bad n, and then others are tried.
 
-**Lemma 2 (rounding).** Coordinates are scaled so that all |q_k| components are at most 1; u = 2^-53. A computed q_k is
-off by 2u a component (difference, scaling), n . q_k by at most (2 + 3) sqrt(3) u < 9u, its value at t by 9u more, |n| by 3u relative, the
-crossing time by 3u of a slope below 3.5. Together below 50 u; `SLACK` = 64 u is added to what a projection must exceed.
+A fixed n is a poor one while a pair rotates. Section 6's cubic follows the rotation: while the volume exceeds g times the
+largest area, the distance exceeds g (`cubic`). Its root from below is where the iteration starts; without one the pair is done.
 
-All of this is in double precision, whatever the precision of the scene. Differences of float32 coordinates are exact there or
-nearly so, so float32 scenes are as safe as float64 ones. What comes before is a reject in the scene's own precision, which
-is where nearly all candidates end (Lemma 1 over [0, 1], with the three axes and the direction at the start):
+**Lemma 2 (rounding).** Coordinates are scaled so that all components of q_k are at most 1 in size; u = 2^-53. A computed q_k is
+off by 2u a component (difference, scaling), n . q_k by at most (2 + 3) sqrt(3) u < 9u, its value at t by 9u more; |n| is off
+by 3u relative, and the crossing time by 3u of a slope below 3.5. Together this is below 50u. SLACK = 64u is taken off.
 
-**Lemma 3 (reject).** With components of q_k at most Q and the unit roundoff u of the scene, a computed n . q_k is off by at most
-u |n|_1 Q for the differences and 3u |n|_1 Q for the sum; what is made of it before it is compared adds 4u |n|_1 Q. REJECT_SLACK = 16 u
-|n|_1 Q is taken off first.
+All of this is in double precision, whatever the precision of the scene: differences of float32 coordinates are exact there,
+or nearly so, and a float32 scene is as safe as a float64 one. What comes before is a reject in the scene's own precision,
+which is where nearly all candidates end: Lemma 1 over [0, 1] with the three axes and the direction at the start.
 
-**Target.** The gap kept is g = xi + s min(d(0) - xi, reach), s = `backoff`: the barrier needs room. Times are returned as soon as
-the gap is below xi + 1.5 s min(d(0) - xi, reach). What ends in the middle of the iteration (cap of iterations, no
-direction separates any more) returns the last time that is proven.
+**Lemma 3 (reject).** With components of q_k at most Q and u the unit roundoff of the scene, a computed n . q_k is off by at
+most u |n|_1 Q for the differences and 3u |n|_1 Q for the sum, and what is made of it before it is compared adds 4u |n|_1 Q.
+REJECT_SLACK = 16u |n|_1 Q is taken off twice. On an axis nothing rounds but the difference, by u relative.
+
+**Target.** The gap to keep is g = xi + s min(d(0) - xi, reach), s = `backoff`, since the barrier needs room. A time is good
+enough, and returned, when the gap there is below xi + 1.5 s min(d(0) - xi, reach). When iterations run out, or no direction
+separates any more, the last proven time is returned: 0 for a pair that starts at xi, or at rounding from it.
 """
 
 import functools
@@ -38,7 +42,7 @@ from pdipc.contact import cubic as cubics
 from pdipc.precision import Real
 from pdipc.precision import real as real_of
 
-MAX_ITERATIONS = 32
+MAX_ITERATIONS = 64
 SLACK = 64.0 * 2.0**-53
 REJECT_SLACK = 16.0
 STOP = 1.5
@@ -52,7 +56,7 @@ DIRECTIONS = 3  # choices of n that are tried before giving up
 def directions(real: Real) -> SimpleNamespace:
     """Directions between closest points; `choice` 0 is the best guess, 1 and 2 are tried when that one does not separate."""
     scalar, vec3 = real.scalar, real.vec3
-    zero, one = wp.constant(scalar(0.0)), wp.constant(scalar(1.0))
+    zero = wp.constant(scalar(0.0))
 
     @wp.func
     def across(r: vec3, e: vec3) -> vec3:
@@ -132,11 +136,9 @@ def directions(real: Real) -> SimpleNamespace:
                 return -segment_direction(-q00, -q10)
             return -segment_direction(-q01, -q11)
         p0 = q00
-        p1 = q01
         t = f
         if end1:
             p0 = q10
-            p1 = q11
             t = f + b
         if t <= zero:
             return -segment_direction(-q00, -q10)
@@ -246,7 +248,7 @@ def reject(real: Real) -> SimpleNamespace:
 
 
 @functools.cache
-def variant(real: Real, rejects: bool = True, cubic: str = "off", steps: str = "directions") -> SimpleNamespace:
+def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: str = "directions") -> SimpleNamespace:
     """The CCD with some stages left out, so that each can be measured (benchmarks/ccd.py). The defaults are what is used.
 
     cubic: "off", "filter" (no root of Section 6's cubic: done) or "head start" (and begin at its root).
@@ -364,7 +366,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "off", steps: str = "
                             soonest = wp.min(soonest, (f1 - h) / (f1 - g1))
                         if g2 < h:
                             soonest = wp.min(soonest, (f2 - h) / (f2 - g2))
-                        if wp.static(edge_edge):
+                        if wp.static(edge_edge):  # noqa: SIM102
                             if g3 < h:
                                 soonest = wp.min(soonest, (f3 - h) / (f3 - g3))
                         ahead = wp.max(ahead, soonest)
@@ -394,7 +396,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "off", steps: str = "
         Positions at the start (0) and end (1) of a linear motion. xi: minimum separation in metres. backoff: the fraction
         of the gap that is kept. reach: the gap in metres above which it counts no more; may be infinite.
         """
-        if wp.static(rejects):
+        if wp.static(rejects):  # noqa: SIM102
             if first.vertex_triangle(p0, a0, b0, c0, p1, a1, b1, c1, xi, backoff, reach):
                 return scalar(NEVER)
         q2 = relative(c0, p0)
@@ -412,7 +414,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "off", steps: str = "
         xi: scalar, backoff: scalar, reach: scalar,
     ) -> scalar:  # fmt: skip
         """The same for the edges a0-a1 and b0-b1; the second digit is 0 at the start and 1 at the end of the motion."""
-        if wp.static(rejects):
+        if wp.static(rejects):  # noqa: SIM102
             if first.edge_edge(a00, a10, b00, b10, a01, a11, b01, b11, xi, backoff, reach):
                 return scalar(NEVER)
         return narrow(

@@ -1,30 +1,30 @@
 """Section 6: the cubic of coplanarity and its minimum-gradient Newton, completed and with its rounding bounded.
 
-The four vertices of a pair are coplanar where the volume d(t) = (u(t) x v(t)) . w(t) = A t^3 + B t^2 + C t + D (Eq. 15) is zero;
-u, v span the triangle, or are the two edges, and w goes from one primitive to the other. Before the first root, less a
-margin, nothing has met.
+The four vertices of a pair are coplanar where the volume d(t) = (u(t) x v(t)) . w(t) = A t^3 + B t^2 + C t + D (Eq. 15) is
+zero; u and v span the triangle, or are the two edges, and w goes from one primitive to the other. Before the first root,
+less a margin, nothing has met.
 
 This differs from Section 6 in:
-1. The sign is turned so that d(0) > 0, and where |d(0)| is within the margin the answer is 0: with "inside tests" at computed
-   roots, as printed, every pair that starts coplanar (all pairs of a flat cloth) is lost.
+1. The sign is turned so that d(0) > 0, and where |d(0)| is within the margin the answer is 0: with "inside tests" at
+   computed roots, as printed, every pair that starts coplanar (all pairs of a flat cloth) is lost.
 2. The extrema are clipped to [0, 1], and every piece in between is looked at in order: interval III follows when I has no
    root, B^2 <= 3AC has no extrema, and A = 0 needs no special case.
 3. No inside test: what is returned is a lower bound of the time of impact, not the time itself.
-4. The margin may hold a minimum separation: while |d| > xi |u x v|, the planes are farther apart than xi.
+4. The margin may hold a separation g: while |d| > g |u x v|, the two planes (lines) are farther apart than g.
 
-**Lemma (from below).** On a piece [l, r] with slope m = min d' < 0, d(tau) >= d(t) + m (tau - t) for tau >= t. So t - d(t)/m is not
-past the first root in [l, r], wherever in the piece t is. d' is a parabola, so m is its least value at l, r or, where that is
-inside and A > 0, at the inflection -B/(3A), where it is C - B^2/(3A).
+**Lemma 1 (from below).** On a piece [l, r] with m = min d' < 0, d(tau) >= d(t) + m (tau - t) for t <= tau in it. So t - d(t)/m
+is not past the first root, wherever in the piece t is. d' is a parabola, so m is its value at l, at r, or, where that is
+inside and A > 0, at the inflection -B / (3A), where it is C - B^2 / (3A).
 
-**Lemma (pieces).** The computed extrema are the exact ones of a cubic with A, B, C off by 8u relative (the quadratic formula that
-avoids cancellation is backward stable, for both roots together). On [0, 1] that cubic differs from d by 8u (|A| + |B| + |C|), and between its
-extrema it is monotone: positive at both ends is positive in between. Evaluating d adds 6u (|A| + |B| + |C| + |D|), rounding
-of t less than 4u of the same. The margin is EVALUATION = 32 u (|A| + |B| + |C| + |D|).
+**Lemma 2 (pieces).** The computed extrema are the exact ones of a cubic with A, B, C off by 8u relative: the quadratic formula
+that avoids cancellation is backward stable, for both roots together. On [0, 1] that cubic differs from d by 8u (|A| + |B| +
+|C|), and between its extrema it is monotone: positive at both ends is positive in between. With S = |A| + |B| + |C| + |D|,
+evaluating d adds 6u S and rounding of t less than 4u S. EVALUATION = 32u S is taken off.
 
-**Lemma (coefficients).** Let the components of all vertex differences be at most Q and off by u Q, and U, V, W the lengths of u, v, w at the
-start plus those of their changes. Differences of differences are off by at most 16 u Q for u(t), v(t) and 5 u Q for w(t) a component, which
-moves d by 28 u Q (U + V) W + 9 u Q U V; products and sums add 8 u U V W <= 42 u Q U V. The margin is COEFFICIENTS =
-64 u Q (U V + (U + V) W).
+**Lemma 3 (coefficients).** Let the components of all vertex differences be at most Q and off by 2u Q, and U, V, W the lengths
+of u, v, w at the start plus those of their changes. Differences of differences are off by at most 32u Q a component for u(t)
+and v(t), 10u Q for w(t), which moves d by 56u Q (U + V) W + 18u Q U V; products and sums add 8u U V W <= 42u Q U V, and an area
+in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is taken off.
 """
 
 import functools
@@ -35,7 +35,7 @@ import warp as wp
 from pdipc.precision import Real
 
 EVALUATION = 32.0
-COEFFICIENTS = 64.0
+COEFFICIENTS = 128.0
 MAX_ITERATIONS = 16
 NEVER = 2.0
 

@@ -155,8 +155,6 @@ def functions(real: Real) -> SimpleNamespace:
         return scalar(wp.length(w[1] * r1 + w[2] * r2 + w[3] * r3))
 
     return SimpleNamespace(
-        relative=relative,
-        along_segment=along_segment,
         vertex_triangle_weights=vertex_triangle_weights,
         edge_edge_weights=edge_edge_weights,
         vertex_triangle_distance=vertex_triangle_distance,
