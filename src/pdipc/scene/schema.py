@@ -63,8 +63,8 @@ class Simulation(Table):
     outer_tolerance: Positive = Field(
         default=1e-4,
         le=1.0,
-        description="A step has converged when an outer iteration moves no vertex further than this part of the scene size. The "
-        "default is what is customary for IPC at h = 1/100 s; for comparisons with exact solutions take 1e-5 or less.",
+        description="A step has converged when an outer iteration moves no vertex further than this part of the scene size. "
+        "The default is what is customary for IPC at h = 1/100 s; for comparisons with exact solutions take 1e-5 or less.",
     )
     max_outer: int = Field(
         default=50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
