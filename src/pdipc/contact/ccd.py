@@ -25,8 +25,9 @@ or nearly so, and a float32 scene is as safe as a float64 one. What comes before
 which is where nearly all candidates end: Lemma 1 over [0, 1] with the three axes and the direction at the start.
 
 **Lemma 3 (reject).** With components of q_k at most Q and u the unit roundoff of the scene, a computed n . q_k is off by at
-most u |n|_1 Q for the differences and 3u |n|_1 Q for the sum, and what is made of it before it is compared adds 4u |n|_1 Q.
-REJECT_SLACK = 16u |n|_1 Q is taken off twice. On an axis nothing rounds but the difference, by u relative.
+most u |n|_1 Q for the differences and 3u |n|_1 Q for the sum. For edges, n . (b_j - a_1) is n . (b_j - a_0) less
+n . (a_1 - a_0): 15u |n|_1 Q. What is made of it before it is compared adds 4u |n|_1 Q. REJECT_SLACK = 24u |n|_1 Q is taken off,
+at the start and once more for the least of both ends. On an axis nothing rounds but the difference, by u relative.
 
 **Target.** The gap to keep is g = xi + s min(d(0) - xi, reach), s = `backoff`, since the barrier needs room. A time is good
 enough, and returned, when the gap there is below xi + 1.5 s min(d(0) - xi, reach). When iterations run out, or no direction
@@ -44,7 +45,7 @@ from pdipc.precision import real as real_of
 
 MAX_ITERATIONS = 64
 SLACK = 64.0 * 2.0**-53
-REJECT_SLACK = 16.0
+REJECT_SLACK = 24.0
 STOP = 1.5
 NEVER = 2.0
 TOLERANCE = 0.05  # of the volume at the start: where the cubic's iteration ends
@@ -234,11 +235,8 @@ def reject(real: Real) -> SimpleNamespace:
         q10 = b00 - a10
         q11 = b10 - a10
         n = direction.edge_edge(q00, q01, q10, q11, 0)
-        m0 = wp.min(wp.min(wp.dot(n, q00), wp.dot(n, q01)), wp.min(wp.dot(n, q10), wp.dot(n, q11)))
-        m1 = wp.min(
-            wp.min(wp.dot(n, b01 - a01), wp.dot(n, b11 - a01)),
-            wp.min(wp.dot(n, b01 - a11), wp.dot(n, b11 - a11)),
-        )
+        m0 = wp.min(wp.dot(n, q00), wp.dot(n, q01)) - wp.max(wp.dot(n, a10 - a00), zero)
+        m1 = wp.min(wp.dot(n, b01 - a01), wp.dot(n, b11 - a01)) - wp.max(wp.dot(n, a11 - a01), zero)
         wide0 = wp.max(b00, b10) - wp.min(a00, a10)
         wide1 = wp.max(b01, b11) - wp.min(a01, a11)
         size = wp.max(wp.max(wp.max(wide0), wp.max(wide1)), -wp.min(wp.min(low0), wp.min(low1)))
