@@ -33,7 +33,7 @@ def cloth_on_a_sphere(tolerance):
         "mesh": {"shape": "grid", "size": (0.3, 0.3), "cells": (6, 6)},
         "translation": (0.05, 0.125, 0.03),
         "rotation": (0, 20, 0),
-        "material": {"membrane_stiffness": 100.0, "bending_stiffness": 1e-4},
+        "material": {"membrane_stiffness": 100.0, "bending_stiffness": 3e-4},
     }
     return make(body, {"name": "ball", "mesh": {"shape": "sphere", "radius": 0.12}}, tolerance)
 
