@@ -24,16 +24,18 @@ from pdipc.constraints import (
 from pdipc.contact import broad_phase, surface
 from pdipc.forces import ExternalForces
 from pdipc.linear.solver import Solver
-from pdipc.linear.solvers import make_solver
+from pdipc.linear.solvers import SOLVERS, make_solver
 from pdipc.linear.system import System
 from pdipc.parallel import Device
 from pdipc.precision import Real, real
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
+from pdipc.scene.errors import SceneError
 from pdipc.scene.schema import Scene
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
+UNCOUPLED = ("a-jacobi", "direct")  # solvers for matrices without 3x3 contacts, and one that the host drives
 INNER_TOLERANCE = 0.05
 
 
@@ -173,7 +175,12 @@ def build(scene: Scene, device: str | None = None) -> Model:
     mass = np.where(free, mass, 0.0)
     stiffness = constraints.stiffness_matrix(n, sets)
     matrix = stiffness + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
-    options = {"order": sim.solver_order} if sim.linear_solver == "a-jacobi" else {}
+    if sim.linear_solver in UNCOUPLED:
+        raise SceneError(
+            f'simulation.linear_solver is "{sim.linear_solver}", which cannot take the coupled contacts of a recorded step; '
+            f"it must be one of: {', '.join(name for name in SOLVERS if name not in UNCOUPLED)}"
+        )
+    options = {"order": sim.solver_order} if sim.linear_solver == "matrix-powers" else {}
     system = System(place, number, matrix, free)
     solver = make_solver(
         sim.linear_solver, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options
@@ -219,7 +226,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
         projector=constraints.Projector(place, number, n, sets),
         solver=solver,
         surface=skin,
-        broad_phase=broad_phase.BroadPhase(place, number, skin, assembly.rest_positions, scene.contact.broad_phase),
+        broad_phase=broad_phase.BroadPhase(place, number, skin),
         external=ExternalForces(assembly, np.array(sim.gravity), mass),
         rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
         triangles=assembly.triangles,

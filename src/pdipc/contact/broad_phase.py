@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from pdipc.contact import bvh
@@ -25,9 +24,9 @@ class Pairs:
 
 
 class BroadPhase:
-    """Finds candidate pairs. method: "bvh" (primitive BVH), or "auto"."""
+    """Finds candidate pairs, by primitive BVH."""
 
-    def __init__(self, device: Device, real: Real, surface: Surface, rest_positions: np.ndarray, method: str = "auto"):
+    def __init__(self, device: Device, real: Real, surface: Surface):
         self.searcher = bvh.Bvh(device, real, surface)
 
     def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> Pairs:

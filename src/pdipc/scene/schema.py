@@ -77,7 +77,7 @@ class Simulation(Table):
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
-    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that A-Jacobi aggregates in one.")
+    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that matrix-powers takes in one.")
     budget_ms: Positive | None = Field(
         default=None,
         description="Time after which a step takes no further outer iteration, ms; results then depend on the machine.",
@@ -87,10 +87,6 @@ class Simulation(Table):
 class Contact(Table):
     """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
 
-    method: Literal["barrier", "paper"] = Field(
-        default="barrier",
-        description='"barrier" is force-consistent and converges to the IPC solution; "paper" is Eq. (6) as printed.',
-    )
     activation_distance: Positive | None = Field(
         default=None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
     )
@@ -103,8 +99,6 @@ class Contact(Table):
     )
     friction: NotNegative = Field(default=0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
     friction_velocity: Positive = Field(default=1e-3, description="Sliding slower than this counts as sticking, m/s.")
-    restitution: float = Field(default=0.0, ge=0, le=1, description="Part of the approach speed that an impact gives back.")
-    broad_phase: Literal["auto", "bvh", "patches"] = Field(default="auto", description="How candidate pairs are found.")
     truncation: Literal["per_vertex", "global"] = Field(
         default="per_vertex",
         description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens.',

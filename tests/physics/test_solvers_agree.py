@@ -1,0 +1,44 @@
+"""The result does not depend on the linear solver, the number of threads or the precision beyond their tolerances."""
+
+import numpy as np
+import pytest
+
+import pdipc
+from pdipc.model import build
+
+from .scenes import floor, scene, solid, watched
+
+CONTACT = {"activation_distance": 2e-3, "minimum_separation": 1e-4, "friction": 0.3}
+
+
+def run(steps=12, threads=None, monkeypatch=None, **simulation):
+    if threads is not None:
+        monkeypatch.setenv("PDIPC_THREADS", str(threads))
+    body = solid("block", (0.2, 0.2, 0.2), (3, 3, 3), at=(0, 0.125, 0), rotation=(5, 0, 8), velocity=(0, -1, 0))
+    made = watched(scene([body], [floor()], contact=CONTACT, **simulation))
+    for _ in range(steps):
+        assert made.step().converged
+    return made.positions
+
+
+@pytest.mark.parametrize("solver", ["pcg", "chebyshev", "matrix-powers", "sor"])
+def test_solvers_agree(solver):
+    exact = {"outer_tolerance": 1e-6, "max_outer": 500, "linear_iterations": 100}
+    np.testing.assert_allclose(run(linear_solver=solver, **exact), run(**exact), atol=2e-5)
+
+
+def test_precisions_agree():
+    np.testing.assert_allclose(run(precision="float32"), run(precision="float64"), atol=2e-4)
+
+
+def test_threads_give_the_same_bits(monkeypatch):
+    one = run(threads=1, monkeypatch=monkeypatch)
+    for threads in (2, 3):
+        np.testing.assert_array_equal(run(threads=threads, monkeypatch=monkeypatch), one)
+
+
+@pytest.mark.parametrize("solver", ["a-jacobi", "direct"])
+def test_solvers_that_cannot_take_coupled_contacts_are_refused(solver):
+    body = solid("block", (0.2, 0.2, 0.2), (1, 1, 1))
+    with pytest.raises(pdipc.SceneError, match=f'linear_solver is "{solver}".*it must be one of: pcg'):
+        build(scene([body], contact=CONTACT, linear_solver=solver), "cpu")
