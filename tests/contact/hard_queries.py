@@ -145,6 +145,14 @@ def degenerate(rng, n):
     return points
 
 
+def specks(rng, n):
+    """One primitive, or one of its sides, is so small that products of its sides underflow."""
+    points = rng.uniform(-1, 1, (n, 8, 3))
+    small = _powers(rng, n, -170, -15)[:, None, None]
+    first = np.where(rng.random((n, 1)) < 0.5, [1, 1, 0, 0], [0, 1, 1, 1])[:, :, None]
+    return points * np.where(np.tile(first, (1, 2, 1)), small, 1)
+
+
 def rotating(rng, n):
     """Half turns, where the volume has all three of its roots."""
     start = rng.uniform(-1, 1, (n, 4, 3))
@@ -167,5 +175,6 @@ FAMILIES = (
     lattice,
     at_rest,
     degenerate,
+    specks,
     rotating,
 )

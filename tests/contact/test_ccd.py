@@ -73,23 +73,23 @@ def test_the_target_gap_is_kept_and_used(kind, xi, backoff, reach):
     assert (gaps <= xi + 1.5001 * backoff * room[stopped] + 1e-12).mean() > 0.98
 
 
-def test_reject_is_not_fooled_by_its_rounding():
-    """Lemma 3: float32 pairs that come within a few roundings of xi, at the start or the end, along a slanted plane."""
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_rounding_is_taken_off(kind, precision):
+    """Lemmas 2 and 3: pairs within a few roundings of xi along a slanted plane. Without either slack some answers are wrong."""
     rng = np.random.default_rng(5)
-    n = 4000
-    normal = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    n, xi = 12_000, 2.0**-7
+    first = 1 if kind == "vertex_triangle" else 2
     points = rng.uniform(-1, 1, (n, 8, 3)) * [1, 1, 0]
-    xi = 2.0**-7
-    for kind, first in (("vertex_triangle", 1), ("edge_edge", 2)):
-        lifted = points.copy()
-        wobble = 10.0 ** rng.uniform(-9, -5, (n, 1)) * rng.choice([-1, 1], (n, 1))
-        lifted[:, :first, 2] = xi + np.where(rng.random((n, 1)) < 0.5, wobble, 0.1)
-        lifted[:, 4 : 4 + first, 2] = xi + wobble
-        lifted = np.einsum("nij,nkj->nki", normal, lifted).astype(np.float32).astype(float)
-        t = times_of(lifted, kind, "float32", xi, backoff=0.0)
-        moved = t > 0
-        assert (t > 1).any() and (t <= 1).any()
-        assert exact.stays_apart(lifted[moved], kind, np.minimum(t[moved], 1), xi).all()
+    points[: 2 * n // 3, 4:] = points[: 2 * n // 3, :4]
+    wobble = real_of(precision).unit_roundoff * 10.0 ** rng.uniform(-2, 2, (n, 1)) * rng.choice([-1, 1], (n, 1))
+    points[:, :first, 2] = xi + np.where(rng.random((n, 1)) < 0.5, np.abs(wobble), 0.1)
+    points[:, 4 : 4 + first, 2] = xi + wobble
+    points = np.einsum("nij,nkj->nki", np.linalg.qr(rng.normal(size=(n, 3, 3)))[0], points).astype(precision).astype(float)
+    t = times_of(points, kind, precision, xi, backoff=0.0)
+    moved = t > 0
+    assert (t > 1).any() and (t <= 1).any()
+    assert exact.stays_apart(points[moved], kind, np.minimum(t[moved], 1), xi).all()
 
 
 def test_rotation():

@@ -72,11 +72,11 @@ def advance(writer: RunWriter, state: np.ndarray, steps: range, checkpoint_every
     return state
 
 
-def begin(folder, **kwargs) -> tuple[RunWriter, np.ndarray]:
+def begin(folder, as_json: str | None = None, **kwargs) -> tuple[RunWriter, np.ndarray]:
     """A new run with its start."""
     positions, topology = parts()
     state = positions.astype(np.float32)
-    writer = RunWriter.create(folder, json.dumps(scene()), topology, {"device": "cpu"}, **kwargs)
+    writer = RunWriter.create(folder, as_json or json.dumps(scene()), topology, {"device": "cpu"}, **kwargs)
     writer.append(0, 0.0, state.astype(np.float64), {})
     writer.checkpoint(0, {"positions": state, "time": np.float64(0), "step": np.int64(0)})
     return writer, state

@@ -1,0 +1,69 @@
+"""The certificate: what passes through is found, what stays apart is not accused, and a broken record is refused."""
+
+import numpy as np
+import pytest
+
+from pdipc.output.certify import certify
+from pdipc.output.results import RunError, open_run
+from tests.output import runs
+
+pytest.importorskip("ipctk", reason="needs ipctk (extra: witness)")
+
+
+def cloth_moved(folder, *heights: float):
+    """A run of one step in which the cloth's motion passes the given heights, m; the ball reaches up to 0.55."""
+    writer, state = runs.begin(folder)
+    cloth = state[:, 1] > 0.58
+    for outer, height in enumerate(heights):
+        end = state.copy()
+        end[cloth, 1] = height
+        writer.append_segments(1, outer, state, end)
+        state = end
+    writer.append(1, 0.01, state, {})
+    return open_run(folder)
+
+
+def test_a_motion_through_a_body_is_a_hit_though_all_frames_are_clean(tmp_path):
+    run = cloth_moved(tmp_path / "run", 0.56, 0.02)  # ends below the ball
+    certificate = certify(run)
+    assert certificate.segments == 2
+    assert certificate.hits
+    assert {(hit.step, hit.outer) for hit in certificate.hits} == {(1, 1)}
+    assert all('"ball"' in hit.what and '"cloth"' in hit.what for hit in certificate.hits)
+    assert min(hit.toi for hit in certificate.hits) == pytest.approx((0.56 - 0.55) / (0.56 - 0.02), abs=1e-3)
+
+
+def test_coming_very_close_is_no_hit_and_is_measured(tmp_path):
+    top = runs.begin(tmp_path / "start")[1]
+    ball = top[: np.flatnonzero(top[:, 1] > 0.58)[0], 1].max()
+    height = np.float32(ball + 1e-5)
+    certificate = certify(cloth_moved(tmp_path / "run", 0.57, float(height)))
+    assert certificate.hits == []
+    assert certificate.pairs > 0
+    assert certificate.smallest_gap == pytest.approx(float(height) - float(ball), rel=1e-6)
+
+
+def test_obstacles_may_meet_each_other(tmp_path):
+    run = cloth_moved(tmp_path / "run", 0.02)
+    run.scripted[:] = True
+    certificate = certify(run)
+    assert (certificate.pairs, certificate.hits) == (0, [])
+
+
+def test_a_broken_record_is_refused(tmp_path):
+    runs.write(tmp_path / "run", steps=4)
+    certificate = certify(open_run(tmp_path / "run"))
+    assert (certificate.segments, certificate.hits) == (4, [])
+    (tmp_path / "run/segments/000002_0000.npz").unlink()
+    with pytest.raises(RunError, match="broken at step 3"):
+        certify(open_run(tmp_path / "run"))
+
+    writer, state = runs.begin(tmp_path / "without")
+    writer.append(1, 0.01, state, {})
+    with pytest.raises(RunError, match="--certify"):
+        certify(open_run(tmp_path / "without"))
+
+    run = cloth_moved(tmp_path / "other", 0.57)
+    np.save(run.folder / "frames/000001.npy", run.positions(1) + 1e-3)
+    with pytest.raises(RunError, match="last frame"):
+        certify(run)

@@ -1,0 +1,200 @@
+"""The command line: exit codes, messages on the right stream, and what its commands write."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pdipc.cli import app, metres
+from pdipc.output.results import RunWriter, open_run
+from tests.output import runs
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    runs.write(tmp_path / "run", steps=3)
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(runs.scene()))
+    return path
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Puts a simulation in place of the true one that writes what `runs` makes, and records how it was called."""
+    calls = types.SimpleNamespace(interrupt_after=None, given={})
+
+    def run_scene(scene, out_dir, *, steps, device, resume, overwrite, certify, progress):
+        calls.given = {"scene": scene, "steps": steps, "device": device, "resume": resume, "certify": certify}
+        if resume:
+            writer = RunWriter.resume(out_dir)
+            done, arrays = writer.latest_checkpoint()
+            state = arrays["positions"]
+        else:
+            writer, state = runs.begin(out_dir, overwrite=overwrite, as_json=scene.model_dump_json())
+            done = 0
+        total = scene.simulation.steps if steps is None else steps
+        for step in range(done + 1, total + 1):
+            state = runs.advance(writer, state, range(step, step + 1))
+            if step == calls.interrupt_after:
+                os.kill(os.getpid(), signal.SIGINT)
+            result = types.SimpleNamespace(outer=3, barriers=7, smallest_gap=float("inf"))
+            progress(types.SimpleNamespace(step=step, steps=total, result=result))
+
+    monkeypatch.setitem(sys.modules, "pdipc.simulate", types.SimpleNamespace(run_scene=run_scene))
+    return calls
+
+
+def test_help_and_version_need_no_heavy_import():
+    code = (
+        "import sys; from typer.testing import CliRunner; from pdipc.cli import app; r = CliRunner().invoke(app, ['--help']); "
+        "heavy = {'warp', 'numpy', 'scipy', 'pydantic', 'pyvista'} & set(sys.modules); "
+        "sys.exit(r.exit_code or str(heavy or '') or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert runner.invoke(app, ["--version"]).output.startswith("pdipc 0.")
+
+
+def test_bundled_scenes_are_listed():
+    plain = runner.invoke(app, ["scenes", "--plain"]).output.split()
+    assert "cloth_on_sphere" in plain
+    told = runner.invoke(app, ["scenes"]).output.splitlines()
+    assert [line.split()[0] for line in told] == plain
+    assert all(len(line.split()) > 2 for line in told)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run", "nothing"], 1, "no such file"),
+        (["run"], 2, "SCENE"),
+        (["run", "squeeze", "--steps", "-1"], 2, "steps"),
+        (["run", "squeeze", "--solver", "magic"], 2, "--solver"),
+        (["run", "squeeze", "--resume", "--overwrite"], 2, "exclude each other"),
+        (["run", "squeeze", "-o", "nowhere", "--resume"], 1, "does not exist"),
+        (["check", "nowhere"], 1, "nowhere does not exist"),
+        (["render", "nowhere", "-o", "a.png", "--size", "big"], 2, "--size"),
+        (["render", "nowhere", "-o", "a.bmp"], 2, "--output"),
+        (["export", "nowhere", "--format", "stl"], 2, "--format"),
+        (["reproduce", "fig99"], 2, "fig99"),
+        (["frobnicate"], 2, "frobnicate"),
+    ],
+)
+def test_errors_are_one_message_on_stderr(arguments, code, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == code
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+def test_run_passes_options_and_reports(fake, scene, tmp_path):
+    out = tmp_path / "out"
+    options = ["--steps", "4", "--solver", "chebyshev", "--precision", "float64", "--budget-ms", "20", "--certify"]
+    result = runner.invoke(app, ["run", str(scene), "-o", str(out), *options])
+    assert result.exit_code == 0, result.stderr
+    assert "4 steps, 0.04 s simulated" in result.stdout
+    assert "smallest gap 1 mm" in result.stdout
+    sim = fake.given["scene"].simulation
+    assert (sim.linear_solver, sim.precision, sim.budget_ms, sim.steps) == ("chebyshev", "float64", 20.0, 8)
+    assert fake.given["certify"] is True
+    assert open_run(out).frame_count == 5
+
+    again = runner.invoke(app, ["run", str(scene), "-o", str(out)])
+    assert (again.exit_code, "--overwrite" in again.stderr) == (1, True)
+    assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--overwrite", "--steps", "1"]).exit_code == 0
+    assert open_run(out).frame_count == 2
+
+
+def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert runner.invoke(app, ["run", str(scene), "-o", str(whole)]).exit_code == 0
+    fake.interrupt_after = 3
+    result = runner.invoke(app, ["run", str(scene), "-o", str(cut)])
+    assert result.exit_code == 130
+    assert "stopped after step 3 of 8" in result.stderr
+    assert f"pdipc run {scene} -o {cut} --resume" in result.stderr
+    fake.interrupt_after = None
+    assert runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume"]).exit_code == 0
+    assert fake.given["device"] == "cpu"
+    for i in range(9):
+        np.testing.assert_array_equal(open_run(cut).positions(i), open_run(whole).positions(i))
+
+
+def test_resuming_with_another_scene_or_device_is_refused(fake, scene, tmp_path):
+    out = tmp_path / "out"
+    assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--steps", "2"]).exit_code == 0
+    other = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--solver", "direct"])
+    assert (other.exit_code, "simulation.linear_solver differs" in other.stderr) == (1, True)
+    device = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--device", "cuda:0"])
+    assert (device.exit_code, "was run on cpu" in device.stderr) == (1, True)
+    assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--steps", "5"]).exit_code == 0
+    assert open_run(out).frame_count == 6
+
+
+def test_check_finds_what_intersects(folder):
+    result = runner.invoke(app, ["check", str(folder)])
+    assert (result.exit_code, "4 frames" in result.stdout, "no intersection" in result.stdout) == (0, True, True)
+    bad = open_run(folder).positions(3)
+    bad[open_run(folder).topology["body_of_vertex"] == 1, 1] = 0.3  # the cloth cuts the ball in half
+    np.save(folder / "frames/000003.npy", bad)
+    result = runner.invoke(app, ["check", str(folder)])
+    assert result.exit_code == 1
+    assert "frame 3, t = 0.03 s" in result.stdout
+    assert 'of "ball" and triangle' in result.stdout
+    assert '"cloth"' in result.stdout
+    assert "1 of 4 frames intersect" in result.stderr
+
+
+def test_certify_prints_the_verdict(folder):
+    pytest.importorskip("ipctk", reason="needs ipctk (extra: witness)")
+    result = runner.invoke(app, ["certify", str(folder)])
+    assert result.exit_code == 0, result.stderr
+    told = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    assert (told["segments"], told["hits"]) == ("3", "0")
+
+
+def test_check_scene_lists_everything(scene):
+    assert runner.invoke(app, ["check-scene", str(scene)]).exit_code == 0
+    data = runs.scene()
+    data["bodies"][0]["translation"] = [0.0, 0.6, 0.0]  # the ball in the cloth
+    data["obstacles"][0]["translation"] = [0.0, 0.5, 0.0]  # the floor in the ball
+    scene.write_text(json.dumps(data))
+    result = runner.invoke(app, ["check-scene", str(scene)])
+    assert result.exit_code == 1
+    assert len([line for line in result.stdout.splitlines() if line.startswith("- ")]) == 2
+
+
+def test_info_describes_runs_and_scenes(folder, scene):
+    told = runner.invoke(app, ["info", str(folder)])
+    assert told.exit_code == 0, told.stderr
+    assert "4 frames, 0.03 s" in told.stdout
+    assert "cloth" in runner.invoke(app, ["info", str(scene)]).stdout
+    assert runner.invoke(app, ["info", "twisted_cloth"]).exit_code == 0
+
+
+def test_export_writes_beside_the_run(folder):
+    result = runner.invoke(app, ["export", str(folder), "--format", "obj"])
+    assert result.exit_code == 0, result.stderr
+    assert len(list((folder.parent / "run_obj").glob("*.obj"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("length", "text"), [(None, "none"), (float("inf"), "none"), (2.0, "2 m"), (1.2e-3, "1.2 mm"), (3e-8, "30 nm")]
+)
+def test_lengths_for_people(length, text):
+    assert metres(length) == text
