@@ -260,7 +260,8 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     first = reject(real)
     zero, one = wp.constant(wide(0.0)), wp.constant(wide(1.0))
     rounding_down = wp.constant(wide(1.0 - 4.0 * real.unit_roundoff))
-    smallest = wp.constant(wide(1.0e-30))
+    smallest = wp.constant(wide(1.0e-30))  # below, a float32 loses digits
+    shortest_sq = wp.constant(wide(1.0e-280))  # below, a square does
 
     @wp.func
     def relative(x: vec3, origin: vec3) -> wide3:
@@ -317,7 +318,11 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
                     n = direction.edge_edge(q0, q1, q2, p3 + t * (r3 - p3), choice)
                 else:
                     n = direction.vertex_triangle(q0, q1, q2, choice)
-                n *= one / wp.sqrt(wp.dot(n, n))  # not a number for no direction: then every comparison below is false
+                length_sq = wp.dot(n, n)
+                if length_sq > shortest_sq:
+                    n *= one / wp.sqrt(length_sq)
+                else:
+                    n = wide3()  # no direction: the gap below is negative
                 f0 = wp.dot(n, p0)
                 f1 = wp.dot(n, p1)
                 f2 = wp.dot(n, p2)

@@ -24,7 +24,8 @@ evaluating d adds 6u S and rounding of t less than 4u S. EVALUATION = 32u S is t
 **Lemma 3 (coefficients).** Let the components of all vertex differences be at most Q and off by 2u Q, and U, V, W the lengths
 of u, v, w at the start plus those of their changes. Differences of differences are off by at most 32u Q a component for u(t)
 and v(t), 10u Q for w(t), which moves d by 56u Q (U + V) W + 18u Q U V; products and sums add 8u U V W <= 42u Q U V, and an area
-in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is taken off.
+in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is taken off. Underflow is far below the rounding
+of the smallest d(0) that is used.
 """
 
 import functools
@@ -48,6 +49,8 @@ def functions(real: Real) -> SimpleNamespace:
     zero, one = wp.constant(scalar(0.0)), wp.constant(scalar(1.0))
     two, three = wp.constant(scalar(2.0)), wp.constant(scalar(3.0))
     evaluation, coefficient = wp.constant(scalar(EVALUATION * u)), wp.constant(scalar(COEFFICIENTS * u))
+
+    smallest = wp.constant(scalar({"float32": 1.0e-30, "float64": 1.0e-280}[real.name]))  # below, products lose digits
 
     @wp.func
     def coefficients(u0: vec3, v0: vec3, w0: vec3, u1: vec3, v1: vec3, w1: vec3) -> vec4:
@@ -96,7 +99,7 @@ def functions(real: Real) -> SimpleNamespace:
         k = wp.where(k[3] < zero, -k, k)
         rounding = evaluation * (wp.abs(k[0]) + wp.abs(k[1]) + wp.abs(k[2]) + wp.abs(k[3]))
         k[3] = k[3] - margin - rounding
-        if not k[3] > zero:
+        if not k[3] > smallest:
             return zero
         enough = tolerance * k[3]
         # the extrema, where there are any inside
