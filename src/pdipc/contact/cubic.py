@@ -22,10 +22,10 @@ that avoids cancellation is backward stable, for both roots together. On [0, 1] 
 evaluating d adds 6u S and rounding of t less than 4u S. EVALUATION = 32u S is taken off.
 
 **Lemma 3 (coefficients).** Let the components of all vertex differences be at most Q and off by 2u Q, and U, V, W the lengths
-of u, v, w at the start plus those of their changes. Differences of differences are off by at most 32u Q a component for u(t)
-and v(t), 10u Q for w(t), which moves d by 56u Q (U + V) W + 18u Q U V; products and sums add 8u U V W <= 42u Q U V, and an area
-in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is taken off. Underflow is far below the rounding
-of the smallest d(0) that is used.
+of u, v, w at the start plus those of their changes, plus 128u Q so that they hold for the exact vectors too. Differences of
+differences are off by at most 32u Q a component for u(t) and v(t), 10u Q for w(t), which moves d by 56u Q (U + V) W + 18u Q U V;
+products and sums add 8u U V W <= 42u Q U V, and an area in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is
+taken off. Underflow is far below the rounding of the smallest d(0) that is used.
 """
 
 import functools
@@ -71,10 +71,11 @@ def functions(real: Real) -> SimpleNamespace:
     @wp.func
     def coefficient_error(u0: vec3, v0: vec3, w0: vec3, u1: vec3, v1: vec3, w1: vec3, size: scalar) -> scalar:
         """How far d(t) with the computed coefficients may be from the true one on [0, 1]; size: the Q of the lemma."""
-        big_u = wp.length(u0) + wp.length(u1 - u0)
-        big_v = wp.length(v0) + wp.length(v1 - v0)
-        big_w = wp.length(w0) + wp.length(w1 - w0)
-        return coefficient * size * (big_u * big_v + (big_u + big_v) * big_w)
+        off = coefficient * size
+        big_u = wp.length(u0) + wp.length(u1 - u0) + off
+        big_v = wp.length(v0) + wp.length(v1 - v0) + off
+        big_w = wp.length(w0) + wp.length(w1 - w0) + off
+        return off * (big_u * big_v + (big_u + big_v) * big_w)
 
     @wp.func
     def largest_area(u0: vec3, v0: vec3, u1: vec3, v1: vec3) -> scalar:
