@@ -23,9 +23,9 @@ evaluating d adds 6u S and rounding of t less than 4u S. EVALUATION = 32u S is t
 
 **Lemma 3 (coefficients).** Let the components of all vertex differences be at most Q and off by 2u Q, and U, V, W the lengths
 of u, v, w at the start plus those of their changes, plus 128u Q so that they hold for the exact vectors too. Differences of
-differences are off by at most 32u Q a component for u(t) and v(t), 10u Q for w(t), which moves d by 56u Q (U + V) W + 18u Q U V;
-products and sums add 8u U V W <= 42u Q U V, and an area in the margin 14u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W) is
-taken off. Underflow is far below the rounding of the smallest d(0) that is used.
+differences are off by at most 32u Q a component for u(t) and v(t), 10u Q for w(t): d moves by 56u Q (U + V) W + 18u Q U V;
+products and sums add 8u U V W <= 42u Q U V, and an area in the margin 20u Q (U + V) W. COEFFICIENTS = 128u Q (U V + (U + V) W)
+is taken off. Underflow is far below the rounding of the smallest d(0) that is used.
 """
 
 import functools
