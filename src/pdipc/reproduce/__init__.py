@@ -1,0 +1,1 @@
+"""Figures and tables of the paper, one module each: `run(out_dir, small)`."""
