@@ -1,13 +1,16 @@
 """Time of one CCD query, stage by stage and against ipctk, and a long hunt for late answers.
 
     python benchmarks/ccd.py [--queries FILE] [--repeats N] [--output FILE]
+    python benchmarks/ccd.py --record SCENE --steps N --queries FILE
     python benchmarks/ccd.py --nightly N [--seed S]
 
 The first compares on the ground-truth sets of the optional test data, on a made-up step mix (a cloth that moves over another,
 all pairs whose swept boxes come within a millimetre), and on FILE: recorded queries, an npz with arrays `vt` and `ee` (n, 8, 3)
 and optionally `xi`. One CPU thread, kernels only, all in one run. Writes benchmarks/results/ccd.json.
 
-The second asks N queries of every family in tests/contact/hard_queries.py, both kinds, float64 and float32, with and without a
+The second writes such a FILE: all pairs that the last step of a bundled scene's first N asks about.
+
+The third asks N queries of every family in tests/contact/hard_queries.py, both kinds, float64 and float32, with and without a
 minimum separation, and has each answer proven by an independent judge (tests/contact/exact.py). It must end with "late: 0".
 """
 
@@ -96,14 +99,42 @@ def step_mix(size: int = 48, seed: int = 0) -> dict[str, np.ndarray]:
     return {"vertex_triangle": pairs(vertices, faces), "edge_edge": pairs(edges, edges)}
 
 
-def query_sets(recorded: Path | None) -> dict[str, tuple[str, np.ndarray, float]]:
+def record(scene_name: str, steps: int, output: Path) -> None:
+    """Writes the queries of a scene's step number `steps`: of every outer iteration, a pair at most once an iteration."""
+    from pdipc.contact.truncation import Truncation
+    from pdipc.scene.load import load_scene
+    from pdipc.simulate import Simulation
+
+    simulation = Simulation(load_scene(scene_name), device="cpu")
+    for _ in range(steps - 1):
+        simulation.step()
+    found = {"vertex_triangle": [], "edge_edge": []}
+    separations = []
+    truncate = Truncation.truncate
+
+    def observed(self, candidates, x, x_tilde):
+        start_end = np.stack([x.numpy(), x_tilde.numpy()])
+        for kind, queries_found in found.items():
+            count = getattr(candidates, f"{kind}_count")
+            quads = getattr(candidates, f"{kind}_quads").numpy()[:count]
+            queries_found.append(start_end[:, quads].transpose(1, 0, 2, 3).reshape(-1, 8, 3))
+            separations.append(getattr(candidates, f"{kind}_limits").numpy()[:count, 0])
+        return truncate(self, candidates, x, x_tilde)
+
+    Truncation.truncate = observed
+    simulation.step()
+    xi = min((s.min() for s in separations if len(s)), default=0.0)
+    np.savez(output, vt=np.concatenate(found["vertex_triangle"]), ee=np.concatenate(found["edge_edge"]), xi=xi)
+    print({kind: sum(map(len, queries_found)) for kind, queries_found in found.items()}, "xi", xi)
+
+
+def query_sets(recorded: list[Path]) -> dict[str, tuple[str, np.ndarray, float]]:
     """Name -> (kind, points, minimum separation)."""
     sets = {f"step mix, {kind}": (kind, points, 1e-5) for kind, points in step_mix().items()}
-    if recorded is not None:
-        file = np.load(recorded)
-        separation = float(file["xi"]) if "xi" in file else 0.0
+    for path in recorded:
+        file = np.load(path)
         for key, kind in (("vt", "vertex_triangle"), ("ee", "edge_edge")):
-            sets[f"{recorded.stem}, {kind}"] = (kind, file[key], separation)
+            sets[f"{path.stem}, {kind}"] = (kind, file[key], float(file.get("xi", 0.0)))
     if not DATA.exists():
         print("the optional test data is not there: no ground-truth sets")
         return sets
@@ -315,12 +346,23 @@ def nightly(n: int, seed: int) -> int:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--queries", type=Path, help="recorded queries of a real step (npz with vt and ee)")
+    parser.add_argument(
+        "--queries",
+        type=Path,
+        action="append",
+        default=[],
+        help="recorded queries of a real step (npz with vt and ee); may be repeated",
+    )
+    parser.add_argument("--record", metavar="SCENE", help="write --queries from a step of this scene instead")
+    parser.add_argument("--steps", type=int, default=100, help="which step that is")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "ccd.json")
     parser.add_argument("--nightly", type=int, metavar="N", help="hunt for late answers in N queries instead")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.record:
+        record(arguments.record, arguments.steps, arguments.queries[0])
+        return
     if arguments.nightly:
         sys.exit(1 if nightly(arguments.nightly, arguments.seed) else 0)
     result = {"machine": machine(), "threads": 1, "backoff": BACKOFF, "sets": {}}
