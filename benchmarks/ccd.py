@@ -104,8 +104,10 @@ def record(scene_name: str, steps: int, output: Path) -> None:
     from pdipc.contact.truncation import Truncation
     from pdipc.scene.load import load_scene
     from pdipc.simulate import Simulation
+    from pdipc.step import Work
 
     simulation = Simulation(load_scene(scene_name), device="cpu")
+    simulation.work = Work(simulation.model, recorded=False)  # so that Python sees every outer iteration
     for _ in range(steps - 1):
         simulation.step()
     found = {"vertex_triangle": [], "edge_edge": []}
@@ -115,10 +117,11 @@ def record(scene_name: str, steps: int, output: Path) -> None:
     def observed(self, candidates, x, x_tilde):
         start_end = np.stack([x.numpy(), x_tilde.numpy()])
         for kind, queries_found in found.items():
-            count = getattr(candidates, f"{kind}_count")
-            quads = getattr(candidates, f"{kind}_quads").numpy()[:count]
+            listed = getattr(candidates, kind)
+            count = int(listed.count.numpy()[0])
+            quads = listed.quads.numpy()[:count]
             queries_found.append(start_end[:, quads].transpose(1, 0, 2, 3).reshape(-1, 8, 3))
-            separations.append(getattr(candidates, f"{kind}_limits").numpy()[:count, 0])
+            separations.append(listed.limits.numpy()[:count, 0])
         return truncate(self, candidates, x, x_tilde)
 
     Truncation.truncate = observed

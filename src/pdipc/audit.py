@@ -30,15 +30,9 @@ class Audit:
         return self.kinetic + self.elastic + self.barrier + self.gravity
 
 
-def _freeze(model: Model, state: State, work: Work) -> None:
-    if not work.candidates.covers(state.positions):
-        work.candidates.cover(state.positions, state.positions, model.settings.margin)
-    work.pairs.freeze(work.candidates, state.positions)
-
-
 def audit(model: Model, state: State, work: Work) -> Audit:
     """The energies and momenta of `state`."""
-    _freeze(model, state, work)
+    work.list_pairs(state.positions)
     numbers = wp.zeros(2, dtype=model.real.scalar, device=model.device.warp)
     model.projector.energy(state.positions, numbers, 0)
     work.pairs.energy(numbers, 1)
@@ -62,7 +56,7 @@ def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
 
     Without friction, which depends on a step and not on a state alone.
     """
-    _freeze(model, state, work)
+    work.list_pairs(state.positions)
     force = wp.zeros(model.vertex_count, dtype=model.real.vec3, device=model.device.warp)
     work.pairs.linearize(state.positions, state.positions, state.positions, force)
     return force.numpy().astype(np.float64)

@@ -27,6 +27,7 @@ from pdipc.precision import Real
 
 REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads
 CPU_BLOCK = 64  # list entries that one CPU thread takes at a time
+CUDA_BLOCK = 1
 CPU_SPLIT = 2048  # ranges shorter than this stay on one CPU thread when launched from Python
 GRAPH_SPLIT = 256  # likewise inside a recorded graph, where splitting is cheaper
 CUDA_WORKERS = 1 << 17  # threads that share a list on CUDA
@@ -112,6 +113,7 @@ class Device:
         if threads is None:
             threads = int(os.environ.get("PDIPC_THREADS", "0")) or len(os.sched_getaffinity(0))
         self.threads = 1 if self.is_cuda else max(1, threads)
+        self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
         self._meeting = None if self.is_cuda else wp.zeros(32, dtype=wp.int32, device=self.warp)
 
@@ -154,7 +156,7 @@ class Device:
         """Runs `kernel(span, *inputs)` over a list of at most `capacity` entries whose length the kernel reads itself."""
         if self.is_cuda:
             workers = max(1, min(capacity, CUDA_WORKERS))
-            wp.launch(kernel, dim=workers, inputs=[_span(0, workers, 1), *inputs], device=self.warp)
+            wp.launch(kernel, dim=workers, inputs=[_span(0, workers, CUDA_BLOCK), *inputs], device=self.warp)
         elif self._recording is not None:
             part, parts = self._recording, self.threads if capacity >= GRAPH_SPLIT else 1
             if part < parts:
@@ -197,9 +199,24 @@ class Device:
         if self._recording is not None:
             self._meet()
 
+    def once(self, operation: Callable[[], None]) -> None:
+        """Runs, or records, what Warp does as one operation: a scan, the refit of a tree."""
+        if self._recording is None or self._recording == 0:
+            operation()
+        if self._recording is not None:
+            self._meet()
+
+    def scan(self, counts: wp.array, ends_out: wp.array) -> None:
+        """ends_out[i] = counts[0] + ... + counts[i]."""
+        self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
+
     def loop(self, condition: wp.array, body: Callable[[], None]) -> None:
         """Repeats `body` while the one int32 in `condition` is not zero; the body must launch before it changes that."""
         wp.capture_while(condition, body)
+
+    def when(self, condition: wp.array, body: Callable[[], None]) -> None:
+        """Runs `body` if the one int32 in `condition` is not zero; the body must launch before it changes that."""
+        wp.capture_if(condition, body)
 
     def capture(self, launches: Callable[[], None], keep_alive: Any = None) -> Graph:
         """Records what `launches()` launches and returns it as a graph; nothing is run.

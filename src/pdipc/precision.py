@@ -6,6 +6,7 @@ called from Python: `functions(real("float64")).barrier(d, d_hat)`.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,16 @@ class Real:
         module = wp.get_module(f"{name}.{self.name}")
         module.options["enable_backward"] = False
         return module
+
+
+def kernel(module: wp.Module, name: str) -> Callable[[Callable], wp.Kernel]:
+    """Decorator: a kernel called `name`. For kernels that one function makes several of: recorded graphs find kernels by name."""
+
+    def make(function: Callable) -> wp.Kernel:
+        function.__qualname__ = name
+        return wp.kernel(function, module=module)
+
+    return make
 
 
 @functools.cache

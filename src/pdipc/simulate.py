@@ -77,7 +77,7 @@ class Simulation:
     def reset(self) -> None:
         """Back to the start."""
         self.state = self.model.initial_state()
-        self.work.candidates.valid = False
+        self.work.candidates.invalidate()
 
 
 def _merge(results: list[StepResult]) -> StepResult:

@@ -1,7 +1,7 @@
 """One time step: Algorithm 1 of the paper, corrected (docs/paper_map.md)."""
 
 import functools
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -15,7 +15,28 @@ from pdipc.model import Model, State
 from pdipc.parallel import Graph, Reducer
 from pdipc.precision import Real
 
+RESTRUCTURE_EVERY = 32  # steps between rebuilds of the culling's trees
 INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the outer tolerance
+
+STAGES = ("solver", "ccd", "barrier", "misc")
+STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places of the clock, in milliseconds
+RUNNING, CONVERGED, CAPPED, OUT_OF_TIME, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(6))
+STATUS, OUTER, TRUNCATIONS, BARRIERS = (wp.constant(place) for place in range(4))
+COUNTS = 4
+
+# The step is one graph, so its stages are timed where it runs.
+_CLOCK = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long now;
+    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(now));
+    return double(now) * 1e-6;
+#else
+    struct { long long seconds, nanoseconds; } now;
+    int clock_gettime_(int, void*) __asm__("clock_gettime");
+    clock_gettime_(1, &now);
+    return double(now.seconds) * 1e3 + double(now.nanoseconds) * 1e-6;
+#endif
+"""
 
 
 @dataclass
@@ -88,9 +109,79 @@ def kernels(real: Real) -> SimpleNamespace:
         increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
     @wp.kernel(module=module)
-    def distance(first: int, a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), distance_out: wp.array(dtype=scalar)):
+    def begin(first: int, count: wp.array(dtype=wp.int32), going_out: wp.array(dtype=wp.int32)):
+        for i in range(count.shape[0]):
+            count[i] = 0
+        going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def measure(
+        first: int,
+        x: wp.array(dtype=vec3),
+        x_tilde: wp.array(dtype=vec3),
+        moved_out: wp.array(dtype=scalar),
+    ):
+        """How far each vertex wants to go; where that is no number, infinitely far, and it stays."""
         i = first + wp.tid()
-        distance_out[i] = wp.length(a[i] - b[i])
+        moved = wp.length(x_tilde[i] - x[i])
+        if not (moved < scalar(1.0e30)):
+            moved = scalar(wp.inf)
+            x_tilde[i] = x[i]
+        moved_out[i] = moved
+
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        passes: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        increment: wp.array(dtype=scalar),
+        clock: wp.array(dtype=wp.float64),
+        tolerance: scalar,
+        max_outer: int,
+        budget_ms: wp.float64,
+        largest: wp.array(dtype=scalar),
+        count: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """Line 16, on the untruncated motion: the truncated one becomes small because t_I does, converged or not."""
+        status = int(RUNNING)
+        residual = largest[0]
+        free_flight = pairs[0] == 0 and increment[0] <= tolerance
+        if overflow[0] != 0:
+            status = OVERFLOW
+        elif residual >= scalar(wp.inf):
+            status = NOT_FINITE
+            count[OUTER] = count[OUTER] + 1
+        else:
+            count[OUTER] = count[OUTER] + 1
+            count[BARRIERS] = pairs[0]
+            if passes[0] > 0:
+                count[TRUNCATIONS] = count[TRUNCATIONS] + 1
+            if passes[0] == 0 and (residual <= tolerance or free_flight):
+                status = CONVERGED
+            elif budget_ms > wp.float64(0.0) and clock[LAST] - clock[STARTED] > budget_ms:
+                status = OUT_OF_TIME
+            elif count[OUTER] >= max_outer:
+                status = CAPPED
+        count[STATUS] = status
+        going_out[0] = 0
+        if status == RUNNING:
+            going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def commit(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        x_end: wp.array(dtype=vec3),
+        x_out: wp.array(dtype=vec3),
+        x_tilde_out: wp.array(dtype=vec3),
+    ):
+        """The truncated motion is made."""
+        i = first + wp.tid()
+        if count[STATUS] < OVERFLOW:
+            x_out[i] = x_end[i]
+            x_tilde_out[i] = x_end[i]
 
     @wp.kernel(module=module)
     def finish(
@@ -100,31 +191,58 @@ def kernels(real: Real) -> SimpleNamespace:
         h: scalar,
         v: wp.array(dtype=vec3),
         a: wp.array(dtype=vec3),
+        v_out: wp.array(dtype=vec3),
+        a_out: wp.array(dtype=vec3),
     ):
         """Line 18: v = (x - x*) / h, a = (v - v*) / h."""
         i = first + wp.tid()
         velocity = (x[i] - x_start[i]) / h
-        a[i] = (velocity - v[i]) / h
-        v[i] = velocity
+        a_out[i] = (velocity - v[i]) / h
+        v_out[i] = velocity
+
+    @wp.func_native(_CLOCK)
+    def milliseconds() -> wp.float64: ...
+
+    @wp.kernel(module=module)
+    def start_clock(first: int, clock: wp.array(dtype=wp.float64)):
+        for i in range(clock.shape[0]):
+            clock[i] = wp.float64(0.0)
+        now = milliseconds()
+        clock[STARTED] = now
+        clock[LAST] = now
+
+    @wp.kernel(module=module)
+    def mark(first: int, stage: int, clock: wp.array(dtype=wp.float64)):
+        """The time since the last mark belongs to `stage`."""
+        now = milliseconds()
+        clock[stage] = clock[stage] + now - clock[LAST]
+        clock[LAST] = now
 
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 
 
 class Work:
-    """Buffers of a step, allocated once for a model, and the recorded inner loop."""
+    """Buffers of a step, allocated once for a model, and the recorded step.
 
-    def __init__(self, model: Model):
+    recorded: whether steps run as recorded graphs; without, each kernel is launched from Python, with the same bits.
+    """
+
+    def __init__(self, model: Model, recorded: bool = True):
         device, real, n = model.device, model.real, model.vertex_count
         vec3, scalar = real.vec3, real.scalar
-        self.kernels = kernels(real)
+        self.model, self.recorded, self.kernels = model, recorded, kernels(real)
 
         def zeros(dtype, count=n):
             return wp.zeros(count, dtype=dtype, device=device.warp)
 
-        self.x_start, self.x, self.x_tilde, self.z = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
+        self.x_start, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3)
+        self.x, self.v, self.a = zeros(vec3), zeros(vec3), zeros(vec3)
+        self.x_tilde, self.z = zeros(vec3), zeros(vec3)
         self.target, self.acceleration = zeros(vec3), zeros(vec3)
         self.force, self.rhs, self.increment = zeros(vec3), zeros(vec3), zeros(vec3)
-        self.moved, self.numbers = zeros(scalar), zeros(scalar, 1)
+        self.moved, self.residual = zeros(scalar), zeros(scalar, 1)
+        self.count, self.going = zeros(wp.int32, COUNTS), zeros(wp.int32, 1)
+        self.clock = zeros(wp.float64, len(STAGES) + 2)
         self.anderson = Anderson(device, real, n)
         self.largest = Reducer(device, real, n)
         settings = model.settings
@@ -139,13 +257,13 @@ class Work:
         )
         self.pairs = ActivePairs(device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
         self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
-        self._graph: Graph | None = None
-        self._graph_of = -1
-
+        self._graphs: dict[str, Graph] = {}
+        self._graphs_of: tuple[int, int] = (-1, -1)
         self._scripted = False
 
-    def set_scripted(self, model: Model, state: State, time: float) -> None:
+    def set_scripted(self, state: State, time: float) -> None:
         """Where kinematic vertices go by `time`, and the external accelerations; only uploaded where they change."""
+        model = self.model
         if not self._scripted or model.moves:
             self.target.assign(model.kinematic_targets(time))
             model.move_anchors(time)
@@ -154,47 +272,98 @@ class Work:
             self.acceleration.assign(model.external.accelerations(state.time, positions, velocities))
         self._scripted = True
 
-    def inner_loop(self, model: Model) -> None:
-        """Replays the recorded inner loop; records it first where it is new or its arrays were replaced."""
-        if self._graph is None or self._graph_of != self.pairs.generation:
-            self._graph = model.device.capture(lambda: self._launch_inner(model), self)
-            self._graph_of = self.pairs.generation
-        self._graph.launch()
+    def run(self, part: Callable[[], None]) -> None:
+        """Replays `part` of a step; records it first where it is new or arrays were replaced."""
+        if not self.recorded:
+            part()
+            return
+        generation = (self.candidates.generation, self.pairs.generation)
+        if self._graphs_of != generation:
+            self._graphs, self._graphs_of = {}, generation
+        name = part.__name__
+        if name not in self._graphs:
+            self._graphs[name] = self.model.device.capture(part, self)
+        self._graphs[name].launch()
 
-    def _launch_inner(self, model: Model) -> None:
-        """Lines 7 to 12: local-global iterations at fixed barriers."""
-        device, k, s, n = model.device, self.kernels, model.settings, model.vertex_count
-        h, damping = model.real.scalar(s.time_step), model.real.scalar(s.damping)
+    def grow(self) -> bool:
+        """Makes room where a list was full; returns whether one was."""
+        grown = [self.candidates.grow(), self.pairs.grow()]
+        self.candidates.overflow.zero_()
+        return any(grown)
 
-        def local_global() -> None:
-            inputs = [self.x_tilde, self.x_start, self.z, model.mass, model.free, h, damping, self.force, self.increment]
-            device.launch(k.inertia, n, inputs)
-            model.projector.add_forces(self.x_tilde, self.rhs, self.force)  # local projections
-            self.pairs.linearize(self.x, self.x_tilde, self.x_start, self.rhs)
-            model.solver.solve(self.increment, self.rhs, self.pairs)  # global step
-            limits = (INNER_FRACTION * s.outer_tolerance, s.inner_tolerance)
-            self.anderson.advance(self.x_tilde, self.increment, model.free, *limits)
+    def list_pairs(self, x: wp.array) -> None:
+        """Freezes the pairs that are active at x, outside of a step."""
+        while True:
+            self.candidates.cover(x, x, self.model.settings.margin)
+            self.pairs.freeze(self.candidates, x)
+            if not self.grow():
+                return
 
+    # The step, in launches only: it is recorded, and on CUDA the host hears of it when it is over.
+
+    def whole_step(self) -> None:
+        """Algorithm 1."""
+        self.start()
+        self.model.device.loop(self.going, self.outer_iteration)
+        self.finish()
+
+    def start(self) -> None:
+        """Lines 1 to 3."""
+        model, device, k, n = self.model, self.model.device, self.kernels, self.model.vertex_count
+        device.launch_serial(k.start_clock, [self.clock])
+        device.launch_serial(k.begin, [self.count, self.going])
+        device.copy(self.x, self.x_start)
+        start = [self.x_start, self.v_start, self.a_start, self.acceleration, self.target, model.free]
+        device.launch(k.predict, n, [*start, model.real.scalar(model.settings.time_step), self.z, self.x_tilde])
+        self.candidates.check(self.x, self.x_tilde)
+        device.when(self.candidates.needed, self._cover)
+        self._mark("ccd")
+
+    def outer_iteration(self) -> None:
+        """Lines 5 to 16."""
+        device, k, n, s = self.model.device, self.kernels, self.model.vertex_count, self.model.settings
+        self.pairs.freeze(self.candidates, self.x)  # line 5
+        self._mark("barrier")
         self.anderson.begin(s.inner_iterations)
-        device.loop(self.anderson.going, local_global)
+        device.loop(self.anderson.going, self._local_global)  # lines 7 to 12
+        device.launch(k.measure, n, [self.x, self.x_tilde, self.moved])
+        self.largest.max(self.moved, self.residual)
+        self._mark("solver")
+        self.candidates.check(self.x_tilde)
+        device.when(self.candidates.needed, self._cover)  # line 13
+        self.truncation.truncate(self.candidates, self.x, self.x_tilde)  # lines 14 and 15
+        self._mark("ccd")
+        states = [self.pairs.count, self.truncation.passes, self.candidates.overflow, self.anderson.moved, self.clock]
+        limits = [self.model.real.scalar(s.outer_tolerance), s.max_outer, s.budget_ms or 0.0]
+        device.launch_serial(k.decide, [*states, *limits, self.residual, self.count, self.going])
+        device.launch(k.commit, n, [self.count, self.truncation.x_end, self.x, self.x_tilde])
+        self._mark("misc")
 
+    def _local_global(self) -> None:
+        """Lines 8 to 11: local projections and the global step, at fixed barriers."""
+        model, device, k, s = self.model, self.model.device, self.kernels, self.model.settings
+        h, damping = model.real.scalar(s.time_step), model.real.scalar(s.damping)
+        inputs = [self.x_tilde, self.x_start, self.z, model.mass, model.free, h, damping, self.force, self.increment]
+        device.launch(k.inertia, model.vertex_count, inputs)
+        model.projector.add_forces(self.x_tilde, self.rhs, self.force)
+        self.pairs.linearize(self.x, self.x_tilde, self.x_start, self.rhs)
+        model.solver.solve(self.increment, self.rhs, self.pairs)
+        limits = (INNER_FRACTION * s.outer_tolerance, s.inner_tolerance)
+        self.anderson.advance(self.x_tilde, self.increment, model.free, *limits)
 
-class Stopwatch:
-    """Adds up the milliseconds between marks by name."""
+    def finish(self) -> None:
+        """Line 18."""
+        model, k = self.model, self.kernels
+        h = model.real.scalar(model.settings.time_step)
+        inputs = [self.x_start, self.x, h, self.v_start, self.a_start, self.v, self.a]
+        model.device.launch(k.finish, model.vertex_count, inputs)
+        self._mark("misc")
 
-    def __init__(self, device):
-        self.device, self.milliseconds = device, {"solver": 0.0, "ccd": 0.0, "barrier": 0.0, "misc": 0.0}
-        self.started = self.last = time.perf_counter()
+    def _cover(self) -> None:
+        self.candidates.cover(self.x, self.x_tilde, self.model.settings.margin)
 
-    def mark(self, name: str) -> None:
-        now = time.perf_counter()
-        self.milliseconds[name] += 1e3 * (now - self.last)
-        self.last = now
-
-    @property
-    def elapsed(self) -> float:
-        """Milliseconds since the start."""
-        return 1e3 * (time.perf_counter() - self.started)
+    def _mark(self, stage: str) -> None:
+        self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), self.clock])
 
 
 def step(model: Model, state: State, work: Work | None = None, observe=None) -> StepResult:
@@ -204,73 +373,51 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
     every outer iteration's committed motion, (n,) vec3 on the device, for witnesses and certificates.
     """
     work = work or Work(model)
-    device, real, s, k, n = model.device, model.real, model.settings, work.kernels, model.vertex_count
-    clock = Stopwatch(device)
-    h = real.scalar(s.time_step)
-    new = state.copy()
-    new.time, new.step = state.time + s.time_step, state.step + 1
-    work.set_scripted(model, state, new.time)
-    wp.copy(work.x_start, state.positions)
-    wp.copy(work.x, state.positions)
-    v, a = state.velocities, state.accelerations
-    device.launch(k.predict, n, [work.x_start, v, a, work.acceleration, work.target, model.free, h, work.z, work.x_tilde])
-    for counter in (work.anderson.done, model.solver.iterations):
-        counter.zero_()
-    candidates, pairs, truncation = work.candidates, work.pairs, work.truncation
-    margin = s.margin
-    clock.mark("misc")
-
-    converged, truncations, message, residual, smallest = False, 0, "", 0.0, float("inf")
-    outer = 0
-    while not converged and outer < s.max_outer:
-        outer += 1
-        if not (candidates.covers(work.x) and candidates.covers(work.x_tilde)):
-            candidates.cover(work.x, work.x_tilde, margin)
-            clock.mark("ccd")
-        smallest = pairs.freeze(candidates, work.x)  # line 5
-        clock.mark("barrier")
-        work.inner_loop(model)  # lines 7 to 12
-        clock.mark("solver")
-        if not candidates.covers(work.x_tilde):  # line 13
-            candidates.cover(work.x, work.x_tilde, margin)
-        passes = truncation.truncate(candidates, work.x, work.x_tilde)  # lines 14 and 15
-        clock.mark("ccd")
-        truncations += passes > 0
-        device.launch(k.distance, n, [work.x, work.x_tilde, work.moved])
-        work.largest.max(work.moved, work.numbers)
-        residual = float(work.numbers.numpy()[0])
-        last_increment = float(work.anderson.moved.numpy()[0])
-        if not residual < float("inf"):
-            message = "the iterate is not finite; the step kept the last feasible state"
+    work.set_scripted(state, state.time + model.settings.time_step)
+    if state.step % RESTRUCTURE_EVERY == 0:
+        work.candidates.restructure(state.positions)
+    while True:
+        wp.copy(work.x_start, state.positions)
+        wp.copy(work.v_start, state.velocities)
+        wp.copy(work.a_start, state.accelerations)
+        for counter in (work.anderson.done, model.solver.iterations):
+            counter.zero_()
+        motions = []
+        if observe is None:
+            work.run(work.whole_step)
+        else:
+            work.run(work.start)
+            while int(work.going.numpy()[0]) != 0:
+                begin = wp.clone(work.x)
+                work.run(work.outer_iteration)
+                motions.append((begin, wp.clone(work.x)))
+            work.run(work.finish)
+        count = work.count.numpy()
+        if count[STATUS] != OVERFLOW:
             break
-        free_flight = pairs.number == 0 and last_increment <= s.outer_tolerance
-        converged = passes == 0 and (residual <= s.outer_tolerance or free_flight)
-        if observe is not None:
-            observe(work.x, truncation.x_end)
-        wp.copy(work.x, truncation.x_end)
-        wp.copy(work.x_tilde, truncation.x_end)
-        clock.mark("misc")
-        if s.budget_ms is not None and clock.elapsed > s.budget_ms and not converged:
-            message = f"the time budget of {s.budget_ms:g} ms ended the step after {outer} outer iterations"
-            break
-    if not converged and not message:
-        message = f"the cap of {s.max_outer} outer iterations ended the step"
-
-    wp.copy(new.positions, work.x)
-    device.launch(k.finish, n, [work.x_start, work.x, h, new.velocities, new.accelerations])  # line 18
-    return_value = StepResult(
+        if not work.grow():  # a list was full: with more room, the step is taken again
+            raise AssertionError("a list overflowed that had room")
+    for motion in motions:
+        observe(*motion)
+    s, status = model.settings, count[STATUS]
+    message = {
+        CONVERGED: "",
+        CAPPED: f"the cap of {s.max_outer} outer iterations ended the step",
+        OUT_OF_TIME: f"the time budget of {s.budget_ms or 0.0:g} ms ended the step after {count[OUTER]} outer iterations",
+        NOT_FINITE: "the iterate is not finite; the step kept the last feasible state",
+    }[status]
+    new = State(wp.clone(work.x), wp.clone(work.v), wp.clone(work.a), state.time + s.time_step, state.step + 1)
+    return StepResult(
         state=new,
-        converged=converged,
+        converged=bool(status == CONVERGED),
         message=message,
         constraints=model.projector.count,
-        barriers=pairs.number,
+        barriers=int(count[BARRIERS]),
         local_global=int(work.anderson.done.numpy()[0]),
-        outer=outer,
+        outer=int(count[OUTER]),
         linear_iterations=int(model.solver.iterations.numpy()[0]),
-        truncations=truncations,
-        residual=residual,
-        smallest_gap=smallest,
+        truncations=int(count[TRUNCATIONS]),
+        residual=float(work.residual.numpy()[0]),
+        smallest_gap=-float(work.pairs.closest.numpy().max()) if count[BARRIERS] else float("inf"),
+        milliseconds=dict(zip(STAGES, work.clock.numpy().tolist(), strict=False)),
     )
-    clock.mark("misc")
-    return_value.milliseconds = clock.milliseconds
-    return return_value

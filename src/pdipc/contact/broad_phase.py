@@ -1,7 +1,5 @@
 """Collision culling (Algorithm 1, line 13; Section 7.2): which pairs of primitives may meet."""
 
-from dataclasses import dataclass
-
 import warp as wp
 
 from pdipc.contact import bvh
@@ -10,30 +8,29 @@ from pdipc.parallel import Device
 from pdipc.precision import Real
 
 
-@dataclass
-class Pairs:
-    """Candidates: vertex_triangle (vertex, triangle) and edge_edge (edge, later edge) as vec2i, sorted by first, then second.
+class BroadPhase:
+    """Finds candidate pairs, by primitive BVH.
 
-    The arrays may be longer than the counts.
+    lists: vertex-triangle pairs (vertex, triangle) and edge-edge pairs (edge, later edge), each with `pairs` (vec2i, sorted by
+    first, then second) and `count` on the device. overflow: (1,) int32 on the device, set where a list was too short.
     """
 
-    vertex_triangle: wp.array
-    edge_edge: wp.array
-    vertex_triangle_count: int
-    edge_edge_count: int
-
-
-class BroadPhase:
-    """Finds candidate pairs, by primitive BVH."""
-
     def __init__(self, device: Device, real: Real, surface: Surface):
-        self.searcher = bvh.Bvh(device, real, surface)
+        self.overflow = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.searcher = bvh.Bvh(device, real, surface, self.overflow)
+        self.lists = [self.searcher.vertex_triangle, self.searcher.edge_edge]
 
-    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> Pairs:
-        """Every pair whose boxes overlap; a primitive's box holds, of each vertex v, x0_v and x1_v grown by reach_v (m).
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
+        """Lists every pair whose boxes overlap; a primitive's box holds, of each vertex v, x0_v and x1_v grown by reach_v (m).
 
-        Left out: pairs that share a vertex, and pairs of which all vertices are kinematic.
+        Left out: pairs that share a vertex, and pairs of which all vertices are kinematic. Recordable.
         """
         self.searcher.find(x0, x1, reach)
-        s = self.searcher
-        return Pairs(s.vertex_triangle.pairs, s.edge_edge.pairs, s.vertex_triangle.count, s.edge_edge.count)
+
+    def restructure(self, x: wp.array, reach: wp.array) -> None:
+        """Builds what `find` searches anew around x, for speed."""
+        self.searcher.restructure(x, reach)
+
+    def grow(self) -> bool:
+        """Makes room for what overflowed; returns whether anything had to."""
+        return any([found.grow() for found in self.lists])

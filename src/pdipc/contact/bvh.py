@@ -1,21 +1,23 @@
 """Culling by bounding volume hierarchies over primitives: Warp's, one over triangles and one over edges.
 
-The trees are refitted for every list and rebuilt when the boxes have drifted. Each vertex asks the tree of triangles, each edge
-the tree of edges; what it finds goes, in ascending order, into slots of its own, and the slots are then packed. Where slots
-run out, they grow and the query is made again: nothing is dropped.
+The trees are refitted for every list and rebuilt now and then. Each vertex asks the tree of triangles, each edge the tree of
+edges; what it finds goes, in ascending order, into slots of its own, and the slots are then packed. What finds more than its
+slots hold searches again, straight into the list, and a list that is full says so: nothing is dropped.
 """
 
 import functools
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from pdipc.contact.surface import Surface
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
-FIRST_SLOTS = 8  # pairs that a primitive has room for at first
-REBUILD_EVERY = 32  # refits; a refitted tree is correct but grows loose as things move
+SLOTS = 16  # finds of a primitive that are kept; what finds more is searched a second time
+FIRST_PAIRS = 1024  # room of a list at first
+LARGEST_LIST = 2**31 - 1
 
 
 @functools.cache
@@ -78,28 +80,28 @@ def kernels(real: Real) -> SimpleNamespace:
         high_out[i] = wp.max(high[e[0]], high[e[1]])
 
     @wp.func
-    def insert(slots: wp.array(dtype=wp.int32), begin: int, held: int, j: int):
+    def insert(begin: int, held: int, pair: wp.vec2i, out: wp.array(dtype=wp.vec2i)):
         """Keeps a primitive's finds in ascending order, whatever the order of the tree."""
         p = int(held)
-        while p > 0 and slots[begin + wp.max(p - 1, 0)] > j:
-            slots[begin + p] = slots[begin + p - 1]
+        while p > 0 and out[begin + wp.max(p - 1, 0)][1] > pair[1]:
+            out[begin + p] = out[begin + p - 1]
             p -= 1
-        slots[begin + p] = j
+        out[begin + p] = pair
 
-    @wp.kernel(module=module)
-    def find_vertex_triangle(
-        first: int,
+    @wp.func
+    def search_triangles(
+        i: int,
         tree: wp.uint64,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
         kinematic: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
+        begin: int,
         room: int,
-        slots_out: wp.array(dtype=wp.int32),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
+        out: wp.array(dtype=wp.vec2i),
+    ) -> int:
+        """Counts the triangles that the i-th vertex may meet, and lists them if there are no more than `room`."""
         v = vertices[i]
         found = int(0)
         j = int(0)
@@ -109,23 +111,23 @@ def kernels(real: Real) -> SimpleNamespace:
             scripted = kinematic[v] + kinematic[t[0]] + kinematic[t[1]] + kinematic[t[2]]
             if t[0] != v and t[1] != v and t[2] != v and scripted < 4:
                 if found < room:
-                    insert(slots_out, i * room, found, j)
+                    insert(begin, found, wp.vec2i(v, j), out)
                 found += 1
-        found_out[i] = found
+        return found
 
-    @wp.kernel(module=module)
-    def find_edge_edge(
-        first: int,
+    @wp.func
+    def search_edges(
+        i: int,
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
         kinematic: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
+        begin: int,
         room: int,
-        slots_out: wp.array(dtype=wp.int32),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
+        out: wp.array(dtype=wp.vec2i),
+    ) -> int:
+        """Counts the edges after the i-th that it may meet, and lists them if there are no more than `room`."""
         a = edges[i]
         found = int(0)
         j = int(0)
@@ -136,70 +138,152 @@ def kernels(real: Real) -> SimpleNamespace:
                 scripted = kinematic[a[0]] + kinematic[a[1]] + kinematic[b[0]] + kinematic[b[1]]
                 if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1] and scripted < 4:
                     if found < room:
-                        insert(slots_out, i * room, found, j)
+                        insert(begin, found, wp.vec2i(i, j), out)
                     found += 1
-        found_out[i] = found
+        return found
 
     @wp.kernel(module=module)
-    def pack(
+    def find_triangles(
         first: int,
-        names: wp.array(dtype=wp.int32),
+        tree: wp.uint64,
+        vertices: wp.array(dtype=wp.int32),
+        triangles: wp.array(dtype=wp.vec3i),
+        kinematic: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
         room: int,
-        slots: wp.array(dtype=wp.int32),
+        slots_out: wp.array(dtype=wp.vec2i),
+        found_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        found_out[i] = search_triangles(i, tree, vertices, triangles, kinematic, low, high, i * room, room, slots_out)
+
+    @wp.kernel(module=module)
+    def find_edges(
+        first: int,
+        tree: wp.uint64,
+        edges: wp.array(dtype=wp.vec2i),
+        kinematic: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
+        room: int,
+        slots_out: wp.array(dtype=wp.vec2i),
+        found_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        found_out[i] = search_edges(i, tree, edges, kinematic, low, high, i * room, room, slots_out)
+
+    @wp.kernel(module=module)
+    def pack_triangles(
+        first: int,
+        tree: wp.uint64,
+        vertices: wp.array(dtype=wp.int32),
+        triangles: wp.array(dtype=wp.vec3i),
+        kinematic: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
+        room: int,
+        slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
         pairs_out: wp.array(dtype=wp.vec2i),
+        overflow: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
         begin = ends[i] - found[i]
-        name = i
-        if names:
-            name = names[i]
-        for k in range(found[i]):
-            pairs_out[begin + k] = wp.vec2i(name, slots[i * room + k])
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
+        elif ends[i] <= pairs_out.shape[0]:
+            if found[i] > room:
+                search_triangles(i, tree, vertices, triangles, kinematic, low, high, begin, found[i], pairs_out)
+            else:
+                for k in range(found[i]):
+                    pairs_out[begin + k] = slots[i * room + k]
 
-    return SimpleNamespace(
-        vertex_boxes=vertex_boxes,
-        triangle_boxes=triangle_boxes,
-        edge_boxes=edge_boxes,
-        find_vertex_triangle=find_vertex_triangle,
-        find_edge_edge=find_edge_edge,
-        pack=pack,
-    )
+    @wp.kernel(module=module)
+    def pack_edges(
+        first: int,
+        tree: wp.uint64,
+        edges: wp.array(dtype=wp.vec2i),
+        kinematic: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
+        room: int,
+        slots: wp.array(dtype=wp.vec2i),
+        found: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        begin = ends[i] - found[i]
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
+        elif ends[i] <= pairs_out.shape[0]:
+            if found[i] > room:
+                search_edges(i, tree, edges, kinematic, low, high, begin, found[i], pairs_out)
+            else:
+                for k in range(found[i]):
+                    pairs_out[begin + k] = slots[i * room + k]
+
+    @wp.kernel(module=module)
+    def settle(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        capacity: int,
+        count: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        """count: pairs in use; the most pairs found since the last growth."""
+        total = ends[ends.shape[0] - 1]
+        count[0] = total
+        count[1] = wp.max(count[1], total)
+        if total > capacity or total < 0:
+            count[0] = 0
+            overflow[0] = 1
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 
 
-class _List:
-    """Pairs of one kind: slots a primitive, and the packed list."""
+class PairList:
+    """Pairs of one kind: a few slots for each first primitive, and the packed list in order of the first, then the second.
 
-    def __init__(self, device: Device, primitives: int):
-        self.device, self.primitives, self.room = device, primitives, FIRST_SLOTS
+    pairs: vec2i. count: (2,) int32 on the device, pairs in use and the most found. Where the list is too short it is empty, and
+    `overflow` (1,) int32 is set.
+    """
+
+    def __init__(self, device: Device, kernels: SimpleNamespace, primitives: int, overflow: wp.array):
+        self.device, self.kernels, self.primitives, self.overflow = device, kernels, primitives, overflow
         self.found = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
-        self.slots = wp.zeros(max(1, primitives * self.room), dtype=wp.int32, device=device.warp)
-        self.pairs = wp.zeros(1024, dtype=wp.vec2i, device=device.warp)
-        self.count = 0
+        self.slots = wp.zeros(max(1, primitives * SLOTS), dtype=wp.vec2i, device=device.warp)
+        self.pairs = wp.zeros(FIRST_PAIRS, dtype=wp.vec2i, device=device.warp)
+        self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
 
-    def fill(self, query, pack: wp.Kernel, names: wp.array | None) -> None:
-        """query(room, slots, found) launches the search; repeated with more room until everything found fits."""
-        if self.primitives == 0:
-            return
-        query(self.room, self.slots, self.found)
-        most = int(self.found.numpy().max())
-        if most > self.room:
-            self.room = most + most // 2
-            self.slots = wp.zeros(self.primitives * self.room, dtype=wp.int32, device=self.device.warp)
-            query(self.room, self.slots, self.found)
-        wp.utils.array_scan(self.found, self.ends, inclusive=True)
-        self.count = int(self.ends[self.primitives - 1 :].numpy()[0])
-        if self.count > len(self.pairs):
-            self.pairs = wp.zeros(self.count + self.count // 2, dtype=wp.vec2i, device=self.device.warp)
-        self.device.launch(pack, self.primitives, [names, self.room, self.slots, self.found, self.ends, self.pairs])
+    def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
+        """Launches the search `find(first, *inputs, SLOTS, slots, found)`, which counts all and keeps what fits the slots, and
+        `pack`, which searches again where the slots did not hold all."""
+        device, common = self.device, [*inputs, SLOTS, self.slots, self.found]
+        device.launch(find, self.primitives, common, grain=64)
+        device.scan(self.found, self.ends)
+        device.launch_serial(self.kernels.settle, [self.ends, len(self.pairs), self.count, self.overflow])
+        device.launch(pack, self.primitives, [*common, self.ends, self.pairs, self.overflow], grain=16)
+
+    def grow(self) -> bool:
+        """Makes room for what was found; returns whether anything had to."""
+        found = max(int(self.count.numpy()[1]), int(self.found.numpy().sum(dtype=np.int64)))
+        if found > LARGEST_LIST:
+            raise MemoryError(f"{found} candidate pairs: the motion of a step or the activation distance is too large")
+        if found <= len(self.pairs):
+            return False
+        self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
+        return True
 
 
 class Bvh:
     """Candidate pairs by Warp's trees. `find` fills vertex_triangle and edge_edge."""
 
-    def __init__(self, device: Device, real: Real, surface: Surface):
+    def __init__(self, device: Device, real: Real, surface: Surface, overflow: wp.array):
         self.device, self.surface, self.kernels = device, surface, kernels(real)
         n, m, k = len(surface.body_of_vertex), len(surface.triangles), len(surface.edges)
 
@@ -207,31 +291,31 @@ class Bvh:
             return tuple(wp.zeros(count, dtype=wp.vec3, device=device.warp) for _ in range(2))
 
         self.of_vertices, self.of_triangles, self.of_edges = boxes(n), boxes(m), boxes(k)
-        self.vertex_triangle, self.edge_edge = _List(device, len(surface.vertices)), _List(device, k)
-        self._trees: tuple[wp.Bvh, wp.Bvh] | None = None
-        self._refits = 0
+        self.vertex_triangle = PairList(device, self.kernels, len(surface.vertices), overflow)
+        self.edge_edge = PairList(device, self.kernels, k, overflow)
+        self.trees = [wp.Bvh(*self.of_triangles), wp.Bvh(*self.of_edges)] if m else []
 
-    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
-        """Lists the pairs whose swept, inflated boxes overlap; see `broad_phase.BroadPhase.find`."""
+    def restructure(self, x: wp.array, reach: wp.array) -> None:
+        """Builds the trees anew around x: refitted ones stay correct, but grow loose as things move."""
+        self._fit(x, x, reach)
+        for tree in self.trees:
+            tree.rebuild()
+
+    def _fit(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
         device, k, s = self.device, self.kernels, self.surface
         device.launch(k.vertex_boxes, len(x0), [x0, x1, reach, *self.of_vertices])
         device.launch(k.triangle_boxes, len(s.triangles), [s.triangles, *self.of_vertices, *self.of_triangles])
         device.launch(k.edge_boxes, len(s.edges), [s.edges, *self.of_vertices, *self.of_edges])
-        if self._trees is None or self._refits >= REBUILD_EVERY:
-            self._trees, self._refits = (wp.Bvh(*self.of_triangles), wp.Bvh(*self.of_edges)), 0
-        else:
-            for tree in self._trees:
-                tree.refit()
-            self._refits += 1
-        triangle_tree, edge_tree = self._trees
 
-        def vertex_triangle(room: int, slots: wp.array, found: wp.array) -> None:
-            inputs = [triangle_tree.id, s.vertices, s.triangles, s.kinematic, *self.of_vertices, room, slots, found]
-            device.launch(k.find_vertex_triangle, len(s.vertices), inputs, grain=64)
-
-        def edge_edge(room: int, slots: wp.array, found: wp.array) -> None:
-            inputs = [edge_tree.id, s.edges, s.kinematic, *self.of_edges, room, slots, found]
-            device.launch(k.find_edge_edge, len(s.edges), inputs, grain=64)
-
-        self.vertex_triangle.fill(vertex_triangle, k.pack, s.vertices)
-        self.edge_edge.fill(edge_edge, k.pack, None)
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
+        """Lists the pairs whose swept, inflated boxes overlap; see `broad_phase.BroadPhase.find`. Recordable."""
+        if not self.trees:
+            return
+        k, s = self.kernels, self.surface
+        self._fit(x0, x1, reach)
+        for tree in self.trees:
+            self.device.once(tree.refit)
+        triangle_tree, edge_tree = self.trees
+        inputs = [triangle_tree.id, s.vertices, s.triangles, s.kinematic, *self.of_vertices]
+        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.kinematic, *self.of_edges])

@@ -13,7 +13,7 @@ import warp as wp
 from pdipc.contact import distance
 from pdipc.contact.broad_phase import BroadPhase
 from pdipc.contact.surface import Surface
-from pdipc.parallel import Device, Reducer
+from pdipc.parallel import Device, Reducer, Span
 from pdipc.precision import Real
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
@@ -38,7 +38,8 @@ def kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def vertex_triangle_limits(
-        first: int,
+        span: Span,
+        count: wp.array(dtype=wp.int32),
         pairs: wp.array(dtype=wp.vec2i),
         triangles: wp.array(dtype=wp.vec3i),
         body: wp.array(dtype=wp.int32),
@@ -48,19 +49,22 @@ def kernels(real: Real) -> SimpleNamespace:
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
     ):
-        k = first + wp.tid()
-        v = pairs[k][0]
-        t = triangles[pairs[k][1]]
-        quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
-        same = body[v] == body[t[0]]
-        rest_distance = scalar(0.0)
-        if same:
-            rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
-        limits_out[k] = limits(v, t[0], rest_distance, half_separation, d_hat, same)
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                v = pairs[k][0]
+                t = triangles[pairs[k][1]]
+                quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
+                same = body[v] == body[t[0]]
+                rest_distance = scalar(0.0)
+                if same:
+                    rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
+                limits_out[k] = limits(v, t[0], rest_distance, half_separation, d_hat, same)
 
     @wp.kernel(module=module)
     def edge_edge_limits(
-        first: int,
+        span: Span,
+        count: wp.array(dtype=wp.int32),
         pairs: wp.array(dtype=wp.vec2i),
         edges: wp.array(dtype=wp.vec2i),
         body: wp.array(dtype=wp.int32),
@@ -70,15 +74,17 @@ def kernels(real: Real) -> SimpleNamespace:
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
     ):
-        k = first + wp.tid()
-        a = edges[pairs[k][0]]
-        b = edges[pairs[k][1]]
-        quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
-        same = body[a[0]] == body[b[0]]
-        rest_distance = scalar(0.0)
-        if same:
-            rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
-        limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, d_hat, same)
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                a = edges[pairs[k][0]]
+                b = edges[pairs[k][1]]
+                quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
+                same = body[a[0]] == body[b[0]]
+                rest_distance = scalar(0.0)
+                if same:
+                    rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
+                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, d_hat, same)
 
     @wp.kernel(module=module)
     def cover(
@@ -95,20 +101,21 @@ def kernels(real: Real) -> SimpleNamespace:
         high_out[i] = wp.max(x0[i], x1[i]) + grow
 
     @wp.kernel(module=module)
+    def clear(first: int, flag_out: wp.array(dtype=wp.int32)):
+        flag_out[0] = 0
+
+    @wp.kernel(module=module)
     def outside(
         first: int,
         x: wp.array(dtype=vec3),
         low: wp.array(dtype=vec3),
         high: wp.array(dtype=vec3),
-        outside_out: wp.array(dtype=scalar),
+        any_outside: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
-        over = wp.max(wp.max(low[i] - x[i], x[i] - high[i]))
         # a comparison with NaN is false: not inside is outside
-        if over <= scalar(0.0):
-            outside_out[i] = scalar(0.0)
-        else:
-            outside_out[i] = scalar(1.0)
+        if not (wp.max(wp.max(low[i] - x[i], x[i] - high[i])) <= scalar(0.0)):
+            any_outside[0] = 1  # whoever writes, writes the same
 
     @wp.kernel(module=module)
     def reach_of(
@@ -125,16 +132,43 @@ def kernels(real: Real) -> SimpleNamespace:
         vertex_triangle_limits=vertex_triangle_limits,
         edge_edge_limits=edge_edge_limits,
         cover=cover,
+        clear=clear,
         outside=outside,
         reach_of=reach_of,
     )
 
 
-class Candidates:
-    """The candidate pairs of a model, as vertex quadruples with their limits.
+class CandidateList:
+    """The candidate pairs of one kind, as vertex quadruples with their limits, and room for what is found out about each.
 
-    Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1); `*_quads` (k,) vec4i, `*_limits` (k,) vec2 of
-    minimum separation xi and activation distance d_hat in metres, `*_count` how many.
+    Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1). quads: (capacity,) vec4i. limits: (capacity,)
+    vec2 of minimum separation xi and activation distance d_hat, m. count: (1,) int32 on the device.
+    gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`.
+    """
+
+    def __init__(self, device: Device, real: Real, kind: str):
+        self.device, self.real, self.kind = device, real, kind
+
+    def allocate(self, count: wp.array, capacity: int) -> None:
+        """Arrays for `capacity` pairs, of which `count` are in use."""
+
+        def make(size: int, dtype) -> wp.array:
+            return wp.zeros(size, dtype=dtype, device=self.device.warp)
+
+        real, blocks = self.real, -(-capacity // self.device.block)
+        self.count, self.capacity = count, capacity
+        self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
+        self.gaps, self.times = make(capacity, real.scalar), make(capacity, wp.int32)
+        self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
+        self.largest = Reducer(self.device, real, blocks)
+
+
+class Candidates:
+    """The candidate pairs of a model: `vertex_triangle` and `edge_edge`, each a `CandidateList`.
+
+    Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
+    the device; what was listed is then incomplete, and the caller has to `grow` and list again.
+    needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
     """
 
     def __init__(
@@ -155,18 +189,36 @@ class Candidates:
         self.low = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.high = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.reach = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.flags = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.any_outside = wp.zeros(1, dtype=real.scalar, device=device.warp)
-        self.reducer = Reducer(device, real, n)
-        self.valid = False
-        self.vertex_triangle_count = self.edge_edge_count = 0
-        self._allocate(1024, 1024)
+        self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.overflow = broad_phase.overflow
+        self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
+        self.vertex_triangle, self.edge_edge = self.lists
+        self.generation = 0
+        self._allocate()
+        self.invalidate()
 
-    def _allocate(self, vertex_triangle: int, edge_edge: int) -> None:
-        self.vertex_triangle_quads = wp.zeros(vertex_triangle, dtype=wp.vec4i, device=self.device.warp)
-        self.vertex_triangle_limits = wp.zeros(vertex_triangle, dtype=self.real.vec2, device=self.device.warp)
-        self.edge_edge_quads = wp.zeros(edge_edge, dtype=wp.vec4i, device=self.device.warp)
-        self.edge_edge_limits = wp.zeros(edge_edge, dtype=self.real.vec2, device=self.device.warp)
+    def _allocate(self) -> None:
+        for own, found in zip(self.lists, self.broad_phase.lists, strict=True):
+            if self.generation == 0 or own.capacity != len(found.pairs):
+                own.allocate(found.count, len(found.pairs))
+        self.generation += 1
+
+    def invalidate(self) -> None:
+        """Forgets the list: the next `check` asks for a new one."""
+        self.low.fill_(1.0e30)
+        self.high.fill_(-1.0e30)
+
+    def restructure(self, x: wp.array) -> None:
+        """Renews the structures of the culling around x; what they find does not depend on it."""
+        self.broad_phase.restructure(x, self.half_separation)
+
+    def grow(self) -> bool:
+        """Makes room for what overflowed; returns whether anything had to."""
+        if not self.broad_phase.grow():
+            return False
+        self._allocate()
+        self.invalidate()
+        return True
 
     def cover(self, x0: wp.array, x1: wp.array, margin: float) -> None:
         """Lists every pair that can meet, or act, while each vertex v stays within `margin` of the box of x0_v and x1_v."""
@@ -174,28 +226,15 @@ class Candidates:
         self.device.launch(k.cover, n, [x0, x1, self.real.scalar(margin), self.low, self.high])
         half = 0.5 * self.activation_distance
         self.device.launch(k.reach_of, n, [self.half_separation, half, margin, self.reach])
-        pairs = self.broad_phase.find(x0, x1, self.reach)
-        self.vertex_triangle_count, self.edge_edge_count = pairs.vertex_triangle_count, pairs.edge_edge_count
-        sizes = (len(self.vertex_triangle_quads), len(self.edge_edge_quads))
-        if self.vertex_triangle_count > sizes[0] or self.edge_edge_count > sizes[1]:
-            self._allocate(max(sizes[0], int(1.5 * self.vertex_triangle_count)), max(sizes[1], int(1.5 * self.edge_edge_count)))
+        self.broad_phase.find(x0, x1, self.reach)
         common = [self.surface.body_of_vertex, self.rest, self.half_separation, self.activation_distance]
-        self.device.launch(
-            k.vertex_triangle_limits,
-            self.vertex_triangle_count,
-            [pairs.vertex_triangle, self.surface.triangles, *common, self.vertex_triangle_quads, self.vertex_triangle_limits],
-        )
-        self.device.launch(
-            k.edge_edge_limits,
-            self.edge_edge_count,
-            [pairs.edge_edge, self.surface.edges, *common, self.edge_edge_quads, self.edge_edge_limits],
-        )
-        self.valid = True
+        primitives = (self.surface.triangles, self.surface.edges)
+        for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
+            inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]
+            self.device.launch_list(getattr(k, f"{own.kind}_limits"), own.capacity, inputs)
 
-    def covers(self, x: wp.array) -> bool:
-        """Whether every vertex of x is inside the box that the list was made for."""
-        if not self.valid:
-            return False
-        self.device.launch(self.kernels.outside, len(x), [x, self.low, self.high, self.flags])
-        self.reducer.max(self.flags, self.any_outside)
-        return float(self.any_outside.numpy()[0]) == 0.0
+    def check(self, *positions: wp.array) -> None:
+        """needed[0] = 0 if every vertex of all `positions` is inside the box that the list was made for, else 1."""
+        self.device.launch_serial(self.kernels.clear, [self.needed])
+        for x in positions:
+            self.device.launch(self.kernels.outside, len(x), [x, self.low, self.high, self.needed])

@@ -21,9 +21,7 @@ import warp as wp
 from pdipc.contact import barrier, distance
 from pdipc.contact.candidates import Candidates
 from pdipc.parallel import Device, Reducer, Span
-from pdipc.precision import Real
-
-BLOCK = 32  # candidates that one worker measures and counts
+from pdipc.precision import Real, kernel
 
 
 @functools.cache
@@ -31,7 +29,6 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     dist, bar = distance.functions(real), barrier.functions(real)
-    block = wp.constant(BLOCK)
     far = wp.constant(real.scalar(1.0e30))
 
     @wp.func
@@ -58,39 +55,65 @@ def kernels(real: Real) -> SimpleNamespace:
         w = dist.edge_edge_weights(a0, a1, b0, b1)
         return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
 
-    def measure(gap_of):
-        @wp.kernel(module=module)
-        def kernel(
-            first: int,
+    def measure(kind: str, gap_of):
+        @kernel(module, f"measure_{kind}")
+        def measure_gaps(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
             x: wp.array(dtype=vec3),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
-            count: int,
             gaps_out: wp.array(dtype=scalar),
             active_out: wp.array(dtype=wp.int32),
+            closest_out: wp.array(dtype=scalar),
         ):
-            b = first + wp.tid()
-            active = int(0)
-            for k in range(b * block, wp.min((b + 1) * block, count)):
-                gap = gap_of(x, quads[k], limits[k])
-                gaps_out[k] = gap
-                if gap < limits[k][1]:
-                    active += 1
-            active_out[b] = active
+            """Gaps of the candidates; for each block how many are active, and the negative of the smallest gap of those."""
+            worker = span.first + wp.tid()
+            for begin in range(worker * span.block, quads.shape[0], span.step * span.block):
+                active = int(0)
+                smallest = far
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    gap = gap_of(x, quads[k], limits[k])
+                    gaps_out[k] = gap
+                    if gap < limits[k][1]:
+                        active += 1
+                        smallest = wp.min(smallest, gap)
+                active_out[begin // span.block] = active
+                closest_out[begin // span.block] = -smallest
 
-        return kernel
+        return measure_gaps
 
-    def freeze(edge_edge: bool):
-        @wp.kernel(module=module)
-        def kernel(
-            first: int,
+    @wp.kernel(module=module)
+    def total(
+        first: int,
+        ends_a: wp.array(dtype=wp.int32),
+        ends_b: wp.array(dtype=wp.int32),
+        capacity: int,
+        count_out: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        """count: pairs that fit, all pairs, those of the first kind."""
+        first_kind = ends_a[ends_a.shape[0] - 1]
+        found = first_kind + ends_b[ends_b.shape[0] - 1]
+        count_out[0] = wp.min(found, capacity)
+        count_out[1] = found
+        count_out[2] = first_kind
+        if found > capacity:
+            overflow[0] = 1
+
+    def freeze(kind: str):
+        edge_edge = kind == "edge_edge"
+
+        @kernel(module, f"freeze_{kind}")
+        def freeze_pairs(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
             x: wp.array(dtype=vec3),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
-            count: int,
             gaps: wp.array(dtype=scalar),
             ends: wp.array(dtype=wp.int32),
-            offset: int,
+            totals: wp.array(dtype=wp.int32),
             kappa: wp.array(dtype=scalar),
             friction: wp.array(dtype=scalar),
             free: wp.array(dtype=scalar),
@@ -103,47 +126,50 @@ def kernels(real: Real) -> SimpleNamespace:
             coefficient_out: wp.array(dtype=scalar),
             share_out: wp.array(dtype=scalar),
         ):
-            b = first + wp.tid()
-            slot = offset
-            if b > 0:
-                slot += ends[b - 1]
-            for k in range(b * block, wp.min((b + 1) * block, count)):
-                d_hat = limits[k][1]
-                if gaps[k] < d_hat:
-                    q = quads[k]
-                    p0 = x[q[0]]
-                    p1 = x[q[1]] - p0
-                    p2 = x[q[2]] - p0
-                    p3 = x[q[3]] - p0
-                    zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-                    m = scalar(1.0)
-                    a = vec4()
-                    if wp.static(edge_edge):
-                        a = dist.edge_edge_weights(zero, p1, p2, p3)
-                        m = bar.mollifier(zero, p1, p2, p3)
-                    else:
-                        a = dist.vertex_triangle_weights(zero, p1, p2, p3)
-                    r = a[1] * p1 + a[2] * p2 + a[3] * p3
-                    n = wp.normalize(r)
-                    d0 = gaps[k]
-                    # a pair is as stiff as its bodies are heavy; kinematic vertices have no say
-                    ka = kappa[q[0]]
-                    kb = kappa[q[3]]
-                    stiffness = m * scalar(0.5) * (ka + kb)
-                    if ka == scalar(0.0) or kb == scalar(0.0):
-                        stiffness = m * (ka + kb)
-                    quads_out[slot] = q
-                    weights_out[slot] = a
-                    normals_out[slot] = n
-                    gaps_out[slot] = d0
-                    activation_out[slot] = d_hat
-                    stiffness_out[slot] = stiffness
-                    coefficient_out[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
-                    share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
-                    share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
-                    slot += 1
+            worker = span.first + wp.tid()
+            for begin in range(worker * span.block, count[0], span.step * span.block):
+                slot = int(0)
+                if begin > 0:
+                    slot = ends[begin // span.block - 1]
+                if wp.static(edge_edge):
+                    slot += totals[2]
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    d_hat = limits[k][1]
+                    if gaps[k] < d_hat and slot < quads_out.shape[0]:
+                        q = quads[k]
+                        p0 = x[q[0]]
+                        p1 = x[q[1]] - p0
+                        p2 = x[q[2]] - p0
+                        p3 = x[q[3]] - p0
+                        zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+                        m = scalar(1.0)
+                        a = vec4()
+                        if wp.static(edge_edge):
+                            a = dist.edge_edge_weights(zero, p1, p2, p3)
+                            m = bar.mollifier(zero, p1, p2, p3)
+                        else:
+                            a = dist.vertex_triangle_weights(zero, p1, p2, p3)
+                        r = a[1] * p1 + a[2] * p2 + a[3] * p3
+                        n = wp.normalize(r)
+                        d0 = gaps[k]
+                        # a pair is as stiff as its bodies are heavy; kinematic vertices have no say
+                        ka = kappa[q[0]]
+                        kb = kappa[q[3]]
+                        stiffness = m * scalar(0.5) * (ka + kb)
+                        if ka == scalar(0.0) or kb == scalar(0.0):
+                            stiffness = m * (ka + kb)
+                        quads_out[slot] = q
+                        weights_out[slot] = a
+                        normals_out[slot] = n
+                        gaps_out[slot] = d0
+                        activation_out[slot] = d_hat
+                        stiffness_out[slot] = stiffness
+                        coefficient_out[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
+                        share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
+                        share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
+                        slot += 1
 
-        return kernel
+        return freeze_pairs
 
     @wp.kernel(module=module)
     def clear(first: int, values_out: wp.array(dtype=wp.int32)):
@@ -325,10 +351,11 @@ def kernels(real: Real) -> SimpleNamespace:
             energy_out[k] = stiffness[k] * bar.barrier(gaps[k], activation[k])
 
     return SimpleNamespace(
-        measure_vertex_triangle=measure(vertex_triangle_gap),
-        measure_edge_edge=measure(edge_edge_gap),
-        freeze_vertex_triangle=freeze(False),
-        freeze_edge_edge=freeze(True),
+        total=total,
+        measure_vertex_triangle=measure("vertex_triangle", vertex_triangle_gap),
+        measure_edge_edge=measure("edge_edge", edge_edge_gap),
+        freeze_vertex_triangle=freeze("vertex_triangle"),
+        freeze_edge_edge=freeze("edge_edge"),
         clear=clear,
         count_incident=count_incident,
         fill_incident=fill_incident,
@@ -353,24 +380,14 @@ class ActivePairs:
         n = len(kappa)
         self.device, self.real, self.kernels = device, real, kernels(real)
         self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
-        self.count = wp.zeros(1, dtype=wp.int32, device=device.warp)
-        self.number = 0
+        self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; pairs found; of these vertex-triangle
+        self.closest = wp.zeros(2, dtype=real.scalar, device=device.warp)  # smallest gap of each kind, negative, m
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.scalar = None  # the paper mode's scalar diagonal; this mode couples the vertices of a pair instead
         self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
-        self._scratch = {kind: self._measure_buffers(1024) for kind in ("vertex_triangle", "edge_edge")}
         self._allocate(1024)
-
-    def _measure_buffers(self, size: int) -> SimpleNamespace:
-        blocks = -(-size // BLOCK)
-        return SimpleNamespace(
-            size=size,
-            gaps=wp.zeros(size, dtype=self.real.scalar, device=self.device.warp),
-            active=wp.zeros(blocks, dtype=wp.int32, device=self.device.warp),
-            ends=wp.zeros(blocks, dtype=wp.int32, device=self.device.warp),
-        )
 
     def _allocate(self, capacity: int) -> None:
         real = self.real
@@ -388,54 +405,41 @@ class ActivePairs:
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
 
-    def freeze(self, candidates: Candidates, x: wp.array) -> float:
-        """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Returns the smallest gap d in metres."""
+    def freeze(self, candidates: Candidates, x: wp.array) -> None:
+        """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Recordable.
+
+        Where they do not fit, `candidates.overflow` is set and the list is incomplete.
+        """
         k, device = self.kernels, self.device
-        totals = {}
-        smallest = float("inf")
-        kinds = {
-            "vertex_triangle": (candidates.vertex_triangle_quads, candidates.vertex_triangle_limits),
-            "edge_edge": (candidates.edge_edge_quads, candidates.edge_edge_limits),
-        }
-        counts = {"vertex_triangle": candidates.vertex_triangle_count, "edge_edge": candidates.edge_edge_count}
-        for kind, (quads, limits) in kinds.items():
-            totals[kind] = 0
-            if counts[kind] == 0:
-                continue
-            if counts[kind] > self._scratch[kind].size:
-                self._scratch[kind] = self._measure_buffers(len(quads))
-            s = self._scratch[kind]
-            blocks = -(-counts[kind] // BLOCK)
-            measure = getattr(k, f"measure_{kind}")
-            device.launch(measure, blocks, [x, quads, limits, counts[kind], s.gaps, s.active], grain=BLOCK * 8)
-            wp.utils.array_scan(s.active, s.ends, inclusive=True)
-            totals[kind] = int(s.ends[blocks - 1 : blocks].numpy()[0])
-        self.number = sum(totals.values())
-        if self.number > self.capacity:
-            self._allocate(int(1.5 * self.number) + 64)
-        offset = 0
-        for kind, (quads, limits) in kinds.items():
-            s = self._scratch[kind]
-            if totals[kind]:
-                blocks = -(-counts[kind] // BLOCK)
-                inputs = [x, quads, limits, counts[kind], s.gaps, s.ends, offset]
-                inputs += [self.kappa, self.friction_of_vertex, self.free]
-                inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
-                inputs += [self.stiffness, self.coefficient, self.share]
-                device.launch(getattr(k, f"freeze_{kind}"), blocks, inputs, grain=BLOCK)
-            offset += totals[kind]
-        self.count.fill_(self.number)
-        if self.number:
-            smallest = float(self.gaps[: self.number].numpy().min())
+        for slot, c in enumerate(candidates.lists):
+            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.found, c.closest]
+            device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
+            device.scan(c.found, c.ends)
+            c.largest.max(c.closest, self.closest, slot)
+        ends = [c.ends for c in candidates.lists]
+        device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
+        for c in candidates.lists:
+            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.ends, self.count]
+            inputs += [self.kappa, self.friction_of_vertex, self.free]
+            inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
+            inputs += [self.stiffness, self.coefficient, self.share]
+            device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
         self._index()
-        return smallest
+
+    def grow(self) -> bool:
+        """Makes room for what overflowed; returns whether anything had to."""
+        found = int(self.count.numpy()[1])
+        if found <= self.capacity:
+            return False
+        self._allocate(int(1.5 * found) + 64)
+        return True
 
     def _index(self) -> None:
         """Lists each vertex's pairs, in order."""
         k, device, n = self.kernels, self.device, len(self.degree)
         device.launch(k.clear, n, [self.degree])
         device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
-        wp.utils.array_scan(self.degree, self.ends, inclusive=True)
+        device.scan(self.degree, self.ends)
         device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, self.entries])
         if device.is_cuda:
             device.launch(k.sort_incident, n, [self.ends, self.entries])

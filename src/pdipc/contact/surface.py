@@ -33,9 +33,7 @@ def unique_edges(triangles: np.ndarray) -> np.ndarray:
     return np.unique(pairs, axis=0).astype(np.int32)
 
 
-def build(
-    device: Device, triangles: np.ndarray, n_vertices: int, body_of_vertex: np.ndarray, kinematic: np.ndarray
-) -> Surface:
+def build(device: Device, triangles: np.ndarray, n_vertices: int, body_of_vertex: np.ndarray, kinematic: np.ndarray) -> Surface:
     """The surface of triangles (m, 3) int32; body_of_vertex (n,) and kinematic (n,) bool over all n_vertices."""
     triangles = np.ascontiguousarray(triangles, dtype=np.int32)
     edges, vertices = unique_edges(triangles), np.unique(triangles).astype(np.int32)
