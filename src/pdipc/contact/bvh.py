@@ -15,7 +15,7 @@ from pdipc.contact.surface import Surface
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
-SLOTS = 16  # finds of a primitive that are kept; what finds more is searched a second time
+SLOTS = 8  # finds of a primitive that are kept; what finds more is searched a second time
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
 

@@ -95,7 +95,7 @@ class Contact(Table):
         description="Gap that no pair of surfaces ever closes (xi), m; absent: 0.02 activation_distance. Bodies may differ.",
     )
     stiffness_scale: Positive = Field(
-        default=30.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
+        default=100.0, description="Barrier stiffness, in units of a typical vertex mass / h^2; results hardly depend on it."
     )
     friction: NotNegative = Field(default=0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
     friction_velocity: Positive = Field(default=1e-3, description="Sliding slower than this counts as sticking, m/s.")
