@@ -5,7 +5,7 @@ import warp as wp
 
 from pdipc import anderson, parallel
 from pdipc.constraints import projector
-from pdipc.contact import bvh, candidates, pairs, queries, truncation
+from pdipc.contact import bvh, candidates, pairs, patches, queries, sweep, truncation
 from pdipc.precision import real
 from pdipc.step import kernels as step_kernels
 
@@ -16,7 +16,9 @@ FACTORIES = {
     "gather": projector.kernels,
     **{kind.__name__.rsplit(".", 1)[1]: kind.kernels for kind in projector.KINDS},
     "candidates": candidates.kernels,
-    "bvh": bvh.kernels,
+    "sweep": sweep.kernels,
+    "bvh": lambda _: bvh.kernels(),
+    "patches": lambda _: patches.kernels(),
     "pairs": pairs.kernels,
     "truncation": truncation.kernels,
     "time of impact": queries.kernels,

@@ -198,7 +198,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
     def upload(values: np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
 
-    skin = surface.build(place, assembly.triangles, n, assembly.body_of_vertex, ~free)
+    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, ~free)
     return Model(
         scene=scene,
         assembly=assembly,
@@ -226,7 +226,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
         projector=constraints.Projector(place, number, n, sets),
         solver=solver,
         surface=skin,
-        broad_phase=broad_phase.BroadPhase(place, number, skin),
+        broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
         external=ExternalForces(assembly, np.array(sim.gravity), mass),
         rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
         triangles=assembly.triangles,

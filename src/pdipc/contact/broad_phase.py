@@ -2,22 +2,26 @@
 
 import warp as wp
 
-from pdipc.contact import bvh
+from pdipc.contact import bvh, patches
 from pdipc.contact.surface import Surface
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
+METHODS = {"bvh": bvh.Bvh, "patches": patches.PatchCulling}
+AUTO = "patches"  # measured: docs/culling.md
+
 
 class BroadPhase:
-    """Finds candidate pairs, by primitive BVH.
+    """Finds candidate pairs: "bvh", by trees over primitives, or "patches" (Section 7.2). Both list the same.
 
     lists: vertex-triangle pairs (vertex, triangle) and edge-edge pairs (edge, later edge), each with `pairs` (vec2i, sorted by
     first, then second) and `count` on the device. overflow: (1,) int32 on the device, set where a list was too short.
     """
 
-    def __init__(self, device: Device, real: Real, surface: Surface):
+    def __init__(self, device: Device, real: Real, surface: Surface, method: str = "auto"):
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device.warp)
-        self.searcher = bvh.Bvh(device, real, surface, self.overflow)
+        make = METHODS[AUTO if method == "auto" else method]
+        self.searcher = make(device, real, surface, self.overflow)
         self.lists = [self.searcher.vertex_triangle, self.searcher.edge_edge]
 
     def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
@@ -33,4 +37,4 @@ class BroadPhase:
 
     def grow(self) -> bool:
         """Makes room for what overflowed; returns whether anything had to."""
-        return any([found.grow() for found in self.lists])
+        return any([self.searcher.grow(), *(found.grow() for found in self.lists)])

@@ -8,48 +8,18 @@ slots hold searches again, straight into the list, and a list that is full says 
 import functools
 from types import SimpleNamespace
 
-import numpy as np
 import warp as wp
 
+from pdipc.contact import sweep
 from pdipc.contact.surface import Surface
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
-SLOTS = 8  # finds of a primitive that are kept; what finds more is searched a second time
-FIRST_PAIRS = 1024  # room of a list at first
-LARGEST_LIST = 2**31 - 1
-
 
 @functools.cache
-def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
-    module = real.module(__name__)
-    # Boxes are float32, as Warp's trees are. One rounding errs by less than 6e-8 of the coordinate; this is outward of that.
-    outward = wp.constant(1.2e-7)
-
-    @wp.func
-    def below(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f - outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) - wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
-
-    @wp.func
-    def above(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f + outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) + wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
-
-    @wp.kernel(module=module)
-    def vertex_boxes(
-        first: int,
-        x0: wp.array(dtype=vec3),
-        x1: wp.array(dtype=vec3),
-        reach: wp.array(dtype=scalar),
-        low_out: wp.array(dtype=wp.vec3),
-        high_out: wp.array(dtype=wp.vec3),
-    ):
-        i = first + wp.tid()
-        r = vec3(reach[i], reach[i], reach[i])
-        low_out[i] = below(wp.min(x0[i], x1[i]) - r)
-        high_out[i] = above(wp.max(x0[i], x1[i]) + r)
+def kernels() -> SimpleNamespace:
+    module = wp.get_module(__name__)
+    module.options["enable_backward"] = False
 
     @wp.kernel(module=module)
     def triangle_boxes(
@@ -226,73 +196,22 @@ def kernels(real: Real) -> SimpleNamespace:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
 
-    @wp.kernel(module=module)
-    def settle(
-        first: int,
-        ends: wp.array(dtype=wp.int32),
-        capacity: int,
-        count: wp.array(dtype=wp.int32),
-        overflow: wp.array(dtype=wp.int32),
-    ):
-        """count: pairs in use; the most pairs found since the last growth."""
-        total = ends[ends.shape[0] - 1]
-        count[0] = total
-        count[1] = wp.max(count[1], total)
-        if total > capacity or total < 0:
-            count[0] = 0
-            overflow[0] = 1
-
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
-
-
-class PairList:
-    """Pairs of one kind: a few slots for each first primitive, and the packed list in order of the first, then the second.
-
-    pairs: vec2i. count: (2,) int32 on the device, pairs in use and the most found. Where the list is too short it is empty, and
-    `overflow` (1,) int32 is set.
-    """
-
-    def __init__(self, device: Device, kernels: SimpleNamespace, primitives: int, overflow: wp.array):
-        self.device, self.kernels, self.primitives, self.overflow = device, kernels, primitives, overflow
-        self.found = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
-        self.ends = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
-        self.slots = wp.zeros(max(1, primitives * SLOTS), dtype=wp.vec2i, device=device.warp)
-        self.pairs = wp.zeros(FIRST_PAIRS, dtype=wp.vec2i, device=device.warp)
-        self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
-
-    def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
-        """Launches the search `find(first, *inputs, SLOTS, slots, found)`, which counts all and keeps what fits the slots, and
-        `pack`, which searches again where the slots did not hold all."""
-        device, common = self.device, [*inputs, SLOTS, self.slots, self.found]
-        device.launch(find, self.primitives, common, grain=64)
-        device.scan(self.found, self.ends)
-        device.launch_serial(self.kernels.settle, [self.ends, len(self.pairs), self.count, self.overflow])
-        device.launch(pack, self.primitives, [*common, self.ends, self.pairs, self.overflow], grain=16)
-
-    def grow(self) -> bool:
-        """Makes room for what was found; returns whether anything had to."""
-        found = max(int(self.count.numpy()[1]), int(self.found.numpy().sum(dtype=np.int64)))
-        if found > LARGEST_LIST:
-            raise MemoryError(f"{found} candidate pairs: the motion of a step or the activation distance is too large")
-        if found <= len(self.pairs):
-            return False
-        self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
-        return True
 
 
 class Bvh:
     """Candidate pairs by Warp's trees. `find` fills vertex_triangle and edge_edge."""
 
     def __init__(self, device: Device, real: Real, surface: Surface, overflow: wp.array):
-        self.device, self.surface, self.kernels = device, surface, kernels(real)
+        self.device, self.surface, self.kernels, self.sweep = device, surface, kernels(), sweep.kernels(real)
         n, m, k = len(surface.body_of_vertex), len(surface.triangles), len(surface.edges)
 
         def boxes(count: int) -> tuple[wp.array, wp.array]:
             return tuple(wp.zeros(count, dtype=wp.vec3, device=device.warp) for _ in range(2))
 
         self.of_vertices, self.of_triangles, self.of_edges = boxes(n), boxes(m), boxes(k)
-        self.vertex_triangle = PairList(device, self.kernels, len(surface.vertices), overflow)
-        self.edge_edge = PairList(device, self.kernels, k, overflow)
+        self.vertex_triangle = sweep.PairList(device, self.sweep, len(surface.vertices), overflow)
+        self.edge_edge = sweep.PairList(device, self.sweep, k, overflow)
         self.trees = [wp.Bvh(*self.of_triangles), wp.Bvh(*self.of_edges)] if m else []
 
     def restructure(self, x: wp.array, reach: wp.array) -> None:
@@ -301,9 +220,13 @@ class Bvh:
         for tree in self.trees:
             tree.rebuild()
 
+    def grow(self) -> bool:
+        """Nothing beyond the pair lists can overflow."""
+        return False
+
     def _fit(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
         device, k, s = self.device, self.kernels, self.surface
-        device.launch(k.vertex_boxes, len(x0), [x0, x1, reach, *self.of_vertices])
+        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, *self.of_vertices])
         device.launch(k.triangle_boxes, len(s.triangles), [s.triangles, *self.of_vertices, *self.of_triangles])
         device.launch(k.edge_boxes, len(s.edges), [s.edges, *self.of_vertices, *self.of_edges])
 

@@ -23,6 +23,8 @@ from pdipc.contact.candidates import Candidates
 from pdipc.parallel import Device, Reducer, Span
 from pdipc.precision import Real, kernel
 
+FIRST_PAIRS = 1024  # room at first
+
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
@@ -387,7 +389,7 @@ class ActivePairs:
         self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.scalar = None  # the paper mode's scalar diagonal; this mode couples the vertices of a pair instead
         self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
-        self._allocate(1024)
+        self._allocate(FIRST_PAIRS)
 
     def _allocate(self, capacity: int) -> None:
         real = self.real
@@ -431,7 +433,7 @@ class ActivePairs:
         found = int(self.count.numpy()[1])
         if found <= self.capacity:
             return False
-        self._allocate(int(1.5 * found) + 64)
+        self._allocate(found + found // 2)
         return True
 
     def _index(self) -> None:

@@ -1,13 +1,13 @@
 """Patch-based culling (Section 7.2, Fig. 9): voxels of the rest surface, a hierarchy of their boxes, pairs of those that overlap.
 
-A patch holds the primitives whose centers lie in one voxel cell of the rest shape. The paper's voxels are regular; here a cell
-that holds more than WIDTH edges or triangles is halved until it does not, so that a patch is one block of WIDTH boxes whatever
-the mesh. The hierarchy is a complete binary tree in one linear array: node 1 is the root, nodes 2i and 2i + 1 are the children of
+A patch holds the primitives whose centers lie in one voxel of the rest shape. The paper's voxels are regular; here a voxel that
+holds more than WIDTH primitives of a kind is halved until it does not, so that a patch is one block of WIDTH boxes whatever the
+mesh. The hierarchy is a complete binary tree in one linear array: node 1 is the root, nodes 2i and 2i + 1 are the children of
 node i, and patch p is node `leaves + p`. Its structure never changes; its boxes are refitted, leaves to root, for each list.
 
 For each patch the tree gives the patches that it overlaps. Then every primitive tests its box against whole blocks: one
-comparison of WIDTH boxes gives a bit mask. Within a patch, the pairs to be considered (not of a common vertex, not all scripted)
-are pre-built, as a bit mask for each primitive.
+comparison of WIDTH boxes gives a bit mask. Within a patch, the pairs to be considered (no common vertex, not all scripted) are
+pre-built, as a bit mask for each primitive.
 """
 
 import functools
@@ -16,11 +16,13 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from pdipc.contact.primitives import MORTON_BITS, PairList, Primitives
-from pdipc.parallel import Device, Span
+from pdipc.contact import sweep
+from pdipc.contact.surface import MORTON_BITS, Surface
+from pdipc.parallel import Device
+from pdipc.precision import Real
 
 WIDTH = 32  # primitives of one kind in a patch at most: bits of a mask
-CPU_TOP = 4096  # tree nodes that one CPU thread refits faster than a launch for each level would
+FIRST_NEIGHBOURS = 8  # room for overlapping patches of a patch at first, on average
 
 # A block holds the boxes of a patch's primitives by coordinate, so that compilers compare many of them at once. Free places hold
 # an empty box, which overlaps nothing.
@@ -56,6 +58,7 @@ class Patches:
     """Device arrays of the hierarchy; see `PatchCulling`."""
 
     leaves: int
+    capacity: int  # of `neighbours`
     low: wp.array(dtype=wp.vec3)  # of each node
     high: wp.array(dtype=wp.vec3)
     neighbours_end: wp.array(dtype=wp.int32)  # of each patch: where its overlapping patches end in `neighbours`
@@ -182,7 +185,10 @@ def kernels() -> SimpleNamespace:
             else:
                 if node >= patches.leaves:
                     q = node - patches.leaves
-                    if overlap(low, high, patches.low[node], patches.high[node]) and patches.scripted[p] + patches.scripted[q] < 2:
+                    if (
+                        overlap(low, high, patches.low[node], patches.high[node])
+                        and patches.scripted[p] + patches.scripted[q] < 2
+                    ):
                         if fill:
                             patches.neighbours[begin + found] = q
                         found += 1
@@ -199,9 +205,12 @@ def kernels() -> SimpleNamespace:
         found_out[p] = traverse(patches, p, 0, False)
 
     @wp.kernel(module=module)
-    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32)):
+    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
         p = first + wp.tid()
-        traverse(patches, p, patches.neighbours_end[p] - found[p], True)
+        if patches.neighbours_end[p] <= patches.capacity:
+            traverse(patches, p, patches.neighbours_end[p] - found[p], True)
+        else:
+            overflow[0] = 1
 
     @wp.func
     def search_triangles(
@@ -227,7 +236,7 @@ def kernels() -> SimpleNamespace:
         if p > 0:
             first_neighbour = patches.neighbours_end[p - 1]
         found = int(0)
-        for n in range(first_neighbour, patches.neighbours_end[p]):
+        for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
             if overlap(low_v, high_v, patches.low[patches.leaves + q], patches.high[patches.leaves + q]):
                 mask = overlapping(members.boxes, q, low_v, high_v)
@@ -241,7 +250,7 @@ def kernels() -> SimpleNamespace:
                     t = triangles[k]
                     if t[0] != v and t[1] != v and t[2] != v:
                         if found < room:
-                            out[begin + found] = wp.vec2i(r, k)
+                            out[begin + found] = wp.vec2i(v, k)
                         found += 1
         return found
 
@@ -265,7 +274,7 @@ def kernels() -> SimpleNamespace:
         if p > 0:
             first_neighbour = patches.neighbours_end[p - 1]
         found = int(0)
-        for n in range(first_neighbour, patches.neighbours_end[p]):
+        for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
             if q >= p and overlap(low, high, patches.low[patches.leaves + q], patches.high[patches.leaves + q]):
                 mask = overlapping(members.boxes, q, low, high)
@@ -285,8 +294,7 @@ def kernels() -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def find_triangles(
-        span: Span,
-        count: int,
+        first: int,
         patches: Patches,
         vertex_members: Members,
         members: Members,
@@ -294,96 +302,238 @@ def kernels() -> SimpleNamespace:
         triangles: wp.array(dtype=wp.vec3i),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
-        ids: wp.array(dtype=wp.int32),
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
-        worker = span.first + wp.tid()
-        for block in range(worker * span.block, count, span.step * span.block):
-            for r in range(block, wp.min(block + span.block, count)):
-                found_out[r] = search_triangles(
-                    r, patches, vertex_members, members, vertices, triangles, low, high, r * room, room, slots_out
-                )
-
-    @wp.kernel(module=module)
-    def pack_triangles(
-        span: Span,
-        count: int,
-        patches: Patches,
-        vertex_members: Members,
-        members: Members,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
-        ids: wp.array(dtype=wp.int32),
-        room: int,
-        slots: wp.array(dtype=wp.vec2i),
-        found: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        pairs_out: wp.array(dtype=wp.vec2i),
-    ):
-        worker = span.first + wp.tid()
-        for block in range(worker * span.block, count, span.step * span.block):
-            for r in range(block, wp.min(block + span.block, count)):
-                n = found[r]
-                begin = ends[r] - n
-                if n <= room:
-                    for k in range(n):
-                        pair = slots[r * room + k]
-                        pairs_out[begin + k] = wp.vec2i(vertices[r], ids[pair[1]])
-                else:
-                    search_triangles(r, patches, vertex_members, members, vertices, triangles, low, high, begin, n, pairs_out)
-                    for k in range(n):
-                        pair = pairs_out[begin + k]
-                        pairs_out[begin + k] = wp.vec2i(vertices[r], ids[pair[1]])
+        r = first + wp.tid()
+        found_out[r] = search_triangles(
+            r, patches, vertex_members, members, vertices, triangles, low, high, r * room, room, slots_out
+        )
 
     @wp.kernel(module=module)
     def find_edges(
-        span: Span,
-        count: int,
+        first: int,
         patches: Patches,
         members: Members,
         edges: wp.array(dtype=wp.vec2i),
-        ids: wp.array(dtype=wp.int32),
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
-        worker = span.first + wp.tid()
-        for block in range(worker * span.block, count, span.step * span.block):
-            for r in range(block, wp.min(block + span.block, count)):
-                found_out[r] = search_edges(r, patches, members, edges, r * room, room, slots_out)
+        r = first + wp.tid()
+        found_out[r] = search_edges(r, patches, members, edges, r * room, room, slots_out)
 
     @wp.kernel(module=module)
-    def pack_edges(
-        span: Span,
-        count: int,
+    def pack_triangles(
+        first: int,
         patches: Patches,
+        vertex_members: Members,
         members: Members,
-        edges: wp.array(dtype=wp.vec2i),
-        ids: wp.array(dtype=wp.int32),
+        vertices: wp.array(dtype=wp.int32),
+        triangles: wp.array(dtype=wp.vec3i),
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
         room: int,
         slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
         pairs_out: wp.array(dtype=wp.vec2i),
+        overflow: wp.array(dtype=wp.int32),
     ):
-        worker = span.first + wp.tid()
-        for block in range(worker * span.block, count, span.step * span.block):
-            for r in range(block, wp.min(block + span.block, count)):
-                n = found[r]
-                begin = ends[r] - n
-                if n > room:
-                    search_edges(r, patches, members, edges, begin, n, pairs_out)
-                for k in range(n):
-                    pair = wp.vec2i(0, 0)
-                    if n <= room:
-                        pair = slots[r * room + k]
-                    else:
-                        pair = pairs_out[begin + k]
-                    i, j = ids[pair[0]], ids[pair[1]]
-                    pairs_out[begin + k] = wp.vec2i(wp.min(i, j), wp.max(i, j))
+        r = first + wp.tid()
+        begin = ends[r] - found[r]
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
+        elif ends[r] <= pairs_out.shape[0]:
+            if found[r] > room:
+                search_triangles(
+                    r, patches, vertex_members, members, vertices, triangles, low, high, begin, found[r], pairs_out
+                )
+            else:
+                for k in range(found[r]):
+                    pairs_out[begin + k] = slots[r * room + k]
+
+    @wp.kernel(module=module)
+    def pack_edges(
+        first: int,
+        patches: Patches,
+        members: Members,
+        edges: wp.array(dtype=wp.vec2i),
+        room: int,
+        slots: wp.array(dtype=wp.vec2i),
+        found: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        r = first + wp.tid()
+        begin = ends[r] - found[r]
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
+        elif ends[r] <= pairs_out.shape[0]:
+            if found[r] > room:
+                search_edges(r, patches, members, edges, begin, found[r], pairs_out)
+            else:
+                for k in range(found[r]):
+                    pairs_out[begin + k] = slots[r * room + k]
 
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+
+
+class PatchCulling:
+    """Candidate pairs by patches. `find` fills vertex_triangle and edge_edge.
+
+    starts: (patches + 1,) first vertex, edge and triangle of each patch, in the order of the surface.
+    """
+
+    def __init__(self, device: Device, real: Real, surface: Surface, overflow: wp.array):
+        self.device, self.surface, self.overflow = device, surface, overflow
+        self.kernels, self.sweep = kernels(), sweep.kernels(real)
+        self.starts = divide(surface)
+        count = self.count = len(self.starts[0]) - 1
+        members = surface.members
+        scripted = [surface.kinematic_numpy[m].all(axis=1) for m in members]
+        homes = [np.repeat(np.arange(count), np.diff(start)) for start in self.starts]
+
+        def upload(values: np.ndarray, dtype) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device.warp)
+
+        def empty(size: int, dtype) -> wp.array:
+            return wp.zeros(max(1, size), dtype=dtype, device=device.warp)
+
+        moving = [np.zeros(count, dtype=np.uint32) for _ in members]
+        for mask, home, start, still in zip(moving, homes, self.starts, scripted, strict=True):
+            bits = np.where(still, 0, 1 << (np.arange(len(home)) - start[home])).astype(np.uint32)
+            np.bitwise_or.at(mask, home, bits)
+        inside = [
+            _inside(members[0], members[2], homes[0], self.starts[2], scripted[0], scripted[2], False),
+            _inside(members[1], members[1], homes[1], self.starts[1], scripted[1], scripted[1], True),
+            np.zeros(0, dtype=np.uint32),
+        ]
+        self.members = []
+        for kind in range(3):
+            m = Members()
+            m.start, m.home = upload(self.starts[kind], wp.int32), upload(homes[kind], wp.int32)
+            m.inside, m.moving = upload(inside[kind], wp.uint32), upload(moving[kind], wp.uint32)
+            nowhere = np.repeat(np.float32([3e38, -3e38]), 3 * WIDTH)  # free places overlap nothing
+            m.boxes = upload(np.tile(nowhere, count if kind else 0), wp.float32)
+            self.members.append(m)
+
+        self.tree = Patches()
+        self.tree.leaves = 1 << max(0, count - 1).bit_length()
+        low = np.full((2 * self.tree.leaves, 3), 3e38, dtype=np.float32)
+        self.tree.low, self.tree.high = upload(low, wp.vec3), upload(-low, wp.vec3)
+        self.tree.scripted = upload(np.all([mask == 0 for mask in moving], axis=0).astype(np.int32), wp.int32)
+        self.tree.neighbours_end = empty(count, wp.int32)
+        self.found = empty(count, wp.int32)
+        self._room_for_neighbours(FIRST_NEIGHBOURS * count)
+        n = len(surface.body_of_vertex)
+        self.low, self.high = empty(n, wp.vec3), empty(n, wp.vec3)
+        self.vertex_triangle = sweep.PairList(device, self.sweep, len(members[0]), overflow)
+        self.edge_edge = sweep.PairList(device, self.sweep, len(members[1]), overflow)
+
+    def _room_for_neighbours(self, capacity: int) -> None:
+        self.tree.capacity = max(1, capacity)
+        self.tree.neighbours = wp.zeros(self.tree.capacity, dtype=wp.int32, device=self.device.warp)
+
+    def restructure(self, x: wp.array, reach: wp.array) -> None:
+        """Nothing: patches are those of the rest shape."""
+
+    def grow(self) -> bool:
+        """Makes room for more overlapping patches; returns whether anything had to. The pair lists grow by themselves."""
+        wanted = int(self.found.numpy().sum(dtype=np.int64))
+        if wanted <= self.tree.capacity:
+            return False
+        self._room_for_neighbours(wanted + wanted // 2)
+        return True
+
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
+        """Lists the pairs whose swept, inflated boxes overlap; see `broad_phase.BroadPhase.find`. Recordable."""
+        if self.count == 0:
+            return
+        device, k, s, tree = self.device, self.kernels, self.surface, self.tree
+        of_vertices, (vertex_members, edge_members, triangle_members) = [self.low, self.high], self.members
+        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, *of_vertices])
+        inputs = [edge_members, triangle_members, s.edges, s.triangles, *of_vertices]
+        device.launch(k.fill_blocks, self.count * WIDTH, inputs)
+        inputs = [tree, vertex_members, edge_members, triangle_members, s.vertices, *of_vertices]
+        device.launch(k.fit_patches, self.count, inputs, grain=WIDTH)
+        if device.is_cuda:
+            begin = tree.leaves
+            while begin > 1:
+                begin //= 2
+                device.launch(k.refit_level, begin, [tree, begin])
+        else:
+            device.launch_serial(k.refit_top, [tree, tree.leaves])
+        device.launch(k.count_neighbours, self.count, [tree, self.found], grain=64)
+        device.scan(self.found, tree.neighbours_end)
+        device.launch(k.list_neighbours, self.count, [tree, self.found, self.overflow], grain=64)
+        inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, *of_vertices]
+        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges])
+
+    def statistics(self) -> dict[str, int]:
+        """Of the last `find`: patches, overlapping pairs of patches, and candidates within a patch and between patches."""
+        homes = [np.zeros(len(self.surface.body_of_vertex), dtype=np.int64), *(m.home.numpy() for m in self.members[1:])]
+        homes[0][self.surface.members[0].ravel()] = self.members[0].home.numpy()
+        inside = total = 0
+        for found, (first, second) in ((self.vertex_triangle, (0, 2)), (self.edge_edge, (1, 1))):
+            pairs = found.pairs.numpy()[: int(found.count.numpy()[0])]
+            inside += int(np.count_nonzero(homes[first][pairs[:, 0]] == homes[second][pairs[:, 1]]))
+            total += len(pairs)
+        own = self.count - int(self.tree.scripted.numpy().sum())
+        overlapping = (int(self.found.numpy().sum()) - own) // 2
+        return {"patches": self.count, "overlapping": overlapping, "inside": inside, "between": total - inside}
+
+
+def divide(surface: Surface) -> list[np.ndarray]:
+    """Starts of the patches in the surface's vertices, edges and triangles: voxels, halved while they hold more than WIDTH.
+
+    Voxels are cells of a Morton curve, so they are ranges of each kind.
+    """
+    body = surface.body_of_vertex.numpy()
+    bodies = [body[m[:, 0]] for m in surface.members]
+    ends = [[0] for _ in range(3)]
+
+    def split(ranges: list[tuple[int, int]], bit: int) -> None:
+        sizes = [last - first for first, last in ranges]
+        if max(sizes) == 0:
+            return
+        if max(sizes) <= WIDTH:
+            for end, (_, last) in zip(ends, ranges, strict=True):
+                end.append(last)
+            return
+        if bit < 0:  # more than WIDTH centers in one place
+            middle = [(first + last) // 2 for first, last in ranges]
+        else:
+            lowest = next(codes[first] for codes, (first, last) in zip(surface.codes, ranges, strict=True) if last > first)
+            half = (lowest >> np.uint64(bit + 1) << np.uint64(bit + 1)) | np.uint64(1 << bit)
+            middle = [
+                first + int(np.searchsorted(codes[first:last], half))
+                for codes, (first, last) in zip(surface.codes, ranges, strict=True)
+            ]
+        split([(first, m) for (first, _), m in zip(ranges, middle, strict=True)], bit - 1)
+        split([(m, last) for (_, last), m in zip(ranges, middle, strict=True)], bit - 1)
+
+    for b in np.unique(bodies[2]):
+        split([(int(np.searchsorted(of, b)), int(np.searchsorted(of, b, side="right"))) for of in bodies], 3 * MORTON_BITS - 1)
+    return [np.array(end, dtype=np.int32) for end in ends]
+
+
+def _inside(first, second, home, starts, first_scripted, second_scripted, later: bool) -> np.ndarray:
+    """(len(first),) uint32: for each primitive a mask of the partners in its own patch that it may meet.
+
+    later: only partners after itself, for pairs of one kind.
+    """
+    mask = np.zeros(len(first), dtype=np.uint32)
+    for bit in range(WIDTH):
+        partner = starts[home] + bit
+        there = partner < starts[home + 1]
+        partner = np.minimum(partner, len(second) - 1)
+        shared = (first[:, :, None] == second[partner][:, None, :]).any(axis=(1, 2))
+        wanted = there & ~shared & ~(first_scripted & second_scripted[partner])
+        if later:
+            wanted &= partner > np.arange(len(first))
+        mask |= np.where(wanted, np.uint32(1 << bit), np.uint32(0)).astype(np.uint32)
+    return mask

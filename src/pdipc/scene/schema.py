@@ -99,6 +99,10 @@ class Contact(Table):
     )
     friction: NotNegative = Field(default=0.0, le=10.0, description="Coulomb friction coefficient; a body may set its own.")
     friction_velocity: Positive = Field(default=1e-3, description="Sliding slower than this counts as sticking, m/s.")
+    broad_phase: Literal["auto", "patches", "bvh"] = Field(
+        default="auto",
+        description="Culling: patches of the rest shape (Section 7.2), trees over primitives, or what measured faster (patches).",
+    )
     truncation: Literal["per_vertex", "global"] = Field(
         default="per_vertex",
         description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens.',

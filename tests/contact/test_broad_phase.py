@@ -1,0 +1,158 @@
+"""Culling finds every pair that brute force finds, whichever way it is done, and lists them in one order."""
+
+import data
+import numpy as np
+import pytest
+import warp as wp
+
+from pdipc.contact import broad_phase, patches, surface
+from pdipc.parallel import Device
+from pdipc.precision import real
+from pdipc.scene import generators
+
+METHODS = ("bvh", "patches")
+
+
+def sheet(cells, height, waves=0.0):
+    mesh = generators.Grid(size=(1.0, 1.0), cells=(cells, cells)).mesh()
+    x = mesh.vertices.copy()
+    x[:, 1] = height + waves * np.sin(14.0 * x[:, 0]) * np.cos(9.0 * x[:, 2])
+    return x, mesh.triangles
+
+
+def scene(rng, *, kinematic_last=True):
+    """Two sheets close above each other, the upper folded, and a ball: rest positions, triangles, body, kinematic, motion."""
+    parts = [sheet(9, 0.0), sheet(7, 0.02, 0.05)]
+    ball = generators.Sphere(radius=0.2, cells=4).mesh()
+    parts.append((ball.vertices + [0.1, 0.2, 0.0], ball.triangles))
+    count = np.cumsum([0] + [len(x) for x, _ in parts])
+    rest = np.concatenate([x for x, _ in parts])
+    triangles = np.concatenate([t + first for (_, t), first in zip(parts, count, strict=False)])
+    body = np.repeat(np.arange(3), np.diff(count))
+    kinematic = (body == 2) & kinematic_last
+    x0 = rest + 0.02 * rng.standard_normal(rest.shape)
+    x1 = x0 + 0.03 * rng.standard_normal(rest.shape)
+    reach = rng.uniform(0.001, 0.02, len(rest))
+    return rest, triangles, body, kinematic, x0, x1, reach
+
+
+def search(method, precision, rest, triangles, body, kinematic, x0, x1, reach, threads=None):
+    device, number = Device("cpu", threads), real(precision)
+    skin = surface.build(device, triangles, rest, body, kinematic)
+    found = broad_phase.BroadPhase(device, number, skin, method)
+    arrays = [wp.array(v, dtype=number.vec3, device="cpu") for v in (x0, x1)]
+    arrays.append(wp.array(reach, dtype=number.scalar, device="cpu"))
+    found.restructure(arrays[0], arrays[2])
+    while True:
+        found.find(*arrays)
+        if not found.grow():
+            break
+    pairs = [each.pairs.numpy()[: each.count.numpy()[0]] for each in found.lists]
+    return skin, found, pairs
+
+
+def brute_force(skin, kinematic, x0, x1, reach):
+    """Sets of (vertex, triangle) and (edge, later edge) with overlapping boxes, in float64."""
+    low, high = np.minimum(x0, x1) - reach[:, None], np.maximum(x0, x1) + reach[:, None]
+
+    def overlapping(a, b):
+        al, ah, bl, bh = low[a].min(axis=1), high[a].max(axis=1), low[b].min(axis=1), high[b].max(axis=1)
+        meet = np.all((al[:, None] <= bh[None]) & (bl[None] <= ah[:, None]), axis=2)
+        shared = (a[:, None, :, None] == b[None, :, None, :]).any(axis=(2, 3))
+        still = kinematic[a].all(axis=1)[:, None] & kinematic[b].all(axis=1)[None]
+        return np.argwhere(meet & ~shared & ~still)
+
+    vertices, edges, faces = skin.members
+    vertex_triangle = overlapping(vertices, faces)
+    vertex_triangle[:, 0] = vertices[vertex_triangle[:, 0], 0]
+    edge_edge = overlapping(edges, edges)
+    return vertex_triangle, edge_edge[edge_edge[:, 0] < edge_edge[:, 1]]
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kinematic", [True, False])
+def test_all_that_brute_force_finds(method, precision, kinematic):
+    for seed in range(3):
+        rest, triangles, body, still, x0, x1, reach = scene(np.random.default_rng(seed), kinematic_last=kinematic)
+        number = np.dtype(precision)
+        x0, x1, reach = (np.asarray(v, dtype=number).astype(np.float64) for v in (x0, x1, reach))
+        skin, _, pairs = search(method, precision, rest, triangles, body, still, x0, x1, reach)
+        for found, expected in zip(pairs, brute_force(skin, still, x0, x1, reach), strict=True):
+            found_set, expected_set = set(map(tuple, found)), set(map(tuple, expected))
+            assert len(expected_set) > 100
+            assert expected_set <= found_set
+            # boxes are rounded outward to float32: little more than brute force finds
+            assert len(found_set) <= 1.01 * len(expected_set)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_one_order(precision):
+    """The same list from both, for any number of threads: a run's bits do not depend on the culling."""
+    problem = scene(np.random.default_rng(5))
+    _, _, expected = search("bvh", precision, *problem)
+    for method in METHODS:
+        for threads in (1, 3):
+            _, _, pairs = search(method, precision, *problem, threads=threads)
+            for a, b in zip(pairs, expected, strict=True):
+                assert np.array_equal(a, b)
+    first, second = expected[1].T
+    assert np.all((np.diff(first) > 0) | ((np.diff(first) == 0) & (np.diff(second) > 0)))
+
+
+def test_patches_are_voxels():
+    """Every primitive is in one patch, no patch is over its width, and the tree's boxes hold what is below them."""
+    rest, triangles, body, still, x0, x1, reach = scene(np.random.default_rng(1))
+    skin, found, pairs = search("patches", "float64", rest, triangles, body, still, x0, x1, reach)
+    culling = found.searcher
+    for starts, members in zip(culling.starts, skin.members, strict=True):
+        assert starts[0] == 0
+        assert starts[-1] == len(members)
+        assert np.diff(starts).min() >= 0
+        assert np.diff(starts).max() <= patches.WIDTH
+    tree = culling.tree
+    low, high = tree.low.numpy(), tree.high.numpy()
+    for node in range(1, tree.leaves):
+        for child in (2 * node, 2 * node + 1):
+            assert np.all(low[node] <= low[child])
+            assert np.all(high[node] >= high[child])
+    for p in range(culling.count):
+        for starts, members in zip(culling.starts, skin.members, strict=True):
+            x = np.concatenate([x0[members[starts[p] : starts[p + 1]].ravel()], x1[members[starts[p] : starts[p + 1]].ravel()]])
+            assert np.all(x >= low[tree.leaves + p])
+            assert np.all(x <= high[tree.leaves + p])
+    numbers = culling.statistics()
+    assert numbers["inside"] + numbers["between"] == sum(map(len, pairs))
+    boxes = [(low[tree.leaves + p], high[tree.leaves + p]) for p in range(culling.count)]
+    moving = [not tree.scripted.numpy()[p] for p in range(culling.count)]
+    overlapping = sum(
+        bool(np.all(boxes[p][0] <= boxes[q][1]) and np.all(boxes[q][0] <= boxes[p][1]) and (moving[p] or moving[q]))
+        for p in range(culling.count)
+        for q in range(p)
+    )
+    assert numbers["overlapping"] == overlapping
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["rod-twist", "cloth-ball", "n-body-simulation"])
+def test_published_frames(name, method):
+    """Every pair that the source of the frame lists as a hit is a candidate."""
+    frame = np.load(data.path(f"ccd_frames/{name}.npz"))
+    x0, x1, faces = frame["V0"], frame["V1"], frame["F"]
+    n = len(x0)
+    skin, _, (vertex_triangle, edge_edge) = search(
+        method, "float64", x0, faces, np.zeros(n, int), np.zeros(n, bool), x0, x1, np.zeros(n)
+    )
+    # the source numbers vertices, then edges by their later and then their earlier end, then faces
+    edges = surface.unique_edges(faces)
+    edges = edges[np.lexsort((edges[:, 0], edges[:, 1]))]
+    pairs = frame["pair_ee"][frame["hit_ee"]] - n
+    quads = np.sort(edges[pairs].reshape(-1, 2, 2), axis=2)
+    apart = np.array([len(set(q.ravel())) == 4 for q in quads], dtype=bool)
+    found = {frozenset((tuple(a), tuple(b))) for a, b in skin.members[1][edge_edge].tolist()}
+    assert all(frozenset(map(tuple, q)) in found for q in quads[apart].tolist())
+    pairs = frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]
+    found = {(v, frozenset(skin.members[2][t].tolist())) for v, t in vertex_triangle.tolist()}
+    expected = [(int(v), frozenset(faces[t].tolist())) for v, t in pairs.tolist() if v not in faces[t]]
+    assert len(expected) + apart.sum() > 50
+    assert all(pair in found for pair in expected)
