@@ -24,7 +24,7 @@ def scene(rng, *, kinematic_last=True):
     """Two sheets close above each other, the upper folded, and a ball: rest positions, triangles, body, kinematic, motion."""
     parts = [sheet(9, 0.0), sheet(7, 0.02, 0.05)]
     ball = generators.Sphere(radius=0.2, cells=4).mesh()
-    parts.append((ball.vertices + [0.1, 0.2, 0.0], ball.triangles))
+    parts.append((ball.vertices + np.array([0.1, 0.2, 0.0]), ball.triangles))
     count = np.cumsum([0] + [len(x) for x, _ in parts])
     rest = np.concatenate([x for x, _ in parts])
     triangles = np.concatenate([t + first for (_, t), first in zip(parts, count, strict=False)])

@@ -205,12 +205,11 @@ def kernels() -> SimpleNamespace:
         found_out[p] = traverse(patches, p, 0, False)
 
     @wp.kernel(module=module)
-    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
+    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32)):
         p = first + wp.tid()
-        if patches.neighbours_end[p] <= patches.capacity:
-            traverse(patches, p, patches.neighbours_end[p] - found[p], True)
-        else:
-            overflow[0] = 1
+        begin = patches.neighbours_end[p] - found[p]
+        if begin >= 0 and patches.neighbours_end[p] <= patches.capacity:  # else the list overflows, or the scan has wrapped
+            traverse(patches, p, begin, True)
 
     @wp.func
     def search_triangles(
@@ -234,7 +233,7 @@ def kernels() -> SimpleNamespace:
         low_v, high_v = low[v], high[v]
         first_neighbour = int(0)
         if p > 0:
-            first_neighbour = patches.neighbours_end[p - 1]
+            first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
         found = int(0)
         for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
@@ -272,7 +271,7 @@ def kernels() -> SimpleNamespace:
         low, high = load_low(members.boxes, p * 6 * width + own), load_high(members.boxes, p * 6 * width + own)
         first_neighbour = int(0)
         if p > 0:
-            first_neighbour = patches.neighbours_end[p - 1]
+            first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
         found = int(0)
         for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
@@ -427,6 +426,7 @@ class PatchCulling:
         self.tree.scripted = upload(np.all([mask == 0 for mask in moving], axis=0).astype(np.int32), wp.int32)
         self.tree.neighbours_end = empty(count, wp.int32)
         self.found = empty(count, wp.int32)
+        self.neighbour_count = empty(2, wp.int32)  # listed, and the most found: a later, shorter list must not hide an overflow
         self._room_for_neighbours(FIRST_NEIGHBOURS * count)
         n = len(surface.body_of_vertex)
         self.low, self.high = empty(n, wp.vec3), empty(n, wp.vec3)
@@ -442,10 +442,12 @@ class PatchCulling:
 
     def grow(self) -> bool:
         """Makes room for more overlapping patches; returns whether anything had to. The pair lists grow by themselves."""
-        wanted = int(self.found.numpy().sum(dtype=np.int64))
+        wanted = max(int(self.neighbour_count.numpy()[1]), int(self.found.numpy().sum(dtype=np.int64)))
+        if wanted > sweep.LARGEST_LIST:
+            raise MemoryError(f"{wanted} overlapping patches: the motion of a step or the activation distance is too large")
         if wanted <= self.tree.capacity:
             return False
-        self._room_for_neighbours(wanted + wanted // 2)
+        self._room_for_neighbours(min(wanted + wanted // 2, sweep.LARGEST_LIST))
         return True
 
     def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
@@ -468,7 +470,9 @@ class PatchCulling:
             device.launch_serial(k.refit_top, [tree, tree.leaves])
         device.launch(k.count_neighbours, self.count, [tree, self.found], grain=64)
         device.scan(self.found, tree.neighbours_end)
-        device.launch(k.list_neighbours, self.count, [tree, self.found, self.overflow], grain=64)
+        inputs = [tree.neighbours_end, tree.capacity, self.neighbour_count, self.overflow]
+        device.launch_serial(self.sweep.settle, inputs)
+        device.launch(k.list_neighbours, self.count, [tree, self.found], grain=64)
         inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, *of_vertices]
         self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
         self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges])

@@ -9,7 +9,7 @@ import warp as wp
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
-SLOTS = 8  # finds of a primitive that are kept; what finds more is searched a second time
+SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
 
@@ -53,7 +53,7 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
     ):
-        """count: pairs in use; the most pairs found since the last growth."""
+        """count: entries in use; the most ever found, so that a later find, which fits, does not hide one that did not."""
         total = ends[ends.shape[0] - 1]
         count[0] = total
         count[1] = wp.max(count[1], total)
@@ -75,14 +75,18 @@ class PairList:
         self.device, self.kernels, self.primitives, self.overflow = device, kernels, primitives, overflow
         self.found = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
-        self.slots = wp.zeros(max(1, primitives * SLOTS), dtype=wp.vec2i, device=device.warp)
+        self._room_for_slots(SLOTS)
         self.pairs = wp.zeros(FIRST_PAIRS, dtype=wp.vec2i, device=device.warp)
         self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
 
+    def _room_for_slots(self, each: int) -> None:
+        self.room = each
+        self.slots = wp.zeros(max(1, self.primitives * each), dtype=wp.vec2i, device=self.device.warp)
+
     def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
-        """Launches the search `find(first, *inputs, SLOTS, slots, found)`, which counts all and keeps what fits the slots, and
+        """Launches the search `find(first, *inputs, room, slots, found)`, which counts all and keeps what fits the slots, and
         `pack`, which searches again where the slots did not hold all."""
-        device, common = self.device, [*inputs, SLOTS, self.slots, self.found]
+        device, common = self.device, [*inputs, self.room, self.slots, self.found]
         device.launch(find, self.primitives, common, grain=64)
         device.scan(self.found, self.ends)
         device.launch_serial(self.kernels.settle, [self.ends, len(self.pairs), self.count, self.overflow])
@@ -95,5 +99,8 @@ class PairList:
             raise MemoryError(f"{found} candidate pairs: the motion of a step or the activation distance is too large")
         if found <= len(self.pairs):
             return False
+        average = 2 * found // max(1, self.primitives)
+        if average > self.room:
+            self._room_for_slots(min(average, MOST_SLOTS))
         self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
         return True
