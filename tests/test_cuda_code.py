@@ -3,9 +3,9 @@
 import pytest
 import warp as wp
 
-from pdipc import anderson, parallel
+from pdipc import anderson, energy_rate, parallel
 from pdipc.constraints import projector
-from pdipc.contact import bvh, candidates, pairs, patches, queries, sweep, truncation
+from pdipc.contact import bvh, candidates, pairs, paper, patches, queries, restitution, sweep, truncation
 from pdipc.precision import real
 from pdipc.step import kernels as step_kernels
 
@@ -13,6 +13,7 @@ FACTORIES = {
     "step": step_kernels,
     "reductions": lambda precision: parallel.kernels(precision),
     "anderson": anderson.kernels,
+    "energy_rate": energy_rate.kernels,
     "gather": projector.kernels,
     **{kind.__name__.rsplit(".", 1)[1]: kind.kernels for kind in projector.KINDS},
     "candidates": candidates.kernels,
@@ -20,6 +21,8 @@ FACTORIES = {
     "bvh": lambda _: bvh.kernels(),
     "patches": lambda _: patches.kernels(),
     "pairs": pairs.kernels,
+    "paper": paper.kernels,
+    "restitution": restitution.kernels,
     "truncation": truncation.kernels,
     "time of impact": queries.kernels,
 }

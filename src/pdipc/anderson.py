@@ -194,10 +194,14 @@ class Anderson:
 
     going: (1,) int32, nonzero while the loop goes on. done: (1,) int32, iterations since the caller last set it to zero.
     moved: (1,) m, the largest motion of a vertex in the last iteration's increment.
+
+    The loop ends at its cap of iterations, or once no vertex moves by more than `tolerance` (m), or by more than
+    `relative_tolerance` of what it moved in the first iteration.
     """
 
-    def __init__(self, device: Device, real: Real, count: int):
+    def __init__(self, device: Device, real: Real, count: int, tolerance: float, relative_tolerance: float):
         self.device, self.real, self.count, self.kernels = device, real, count, kernels(real)
+        self.limits = [real.scalar(tolerance), real.scalar(relative_tolerance)]
         self.blocks = max(1, -(-count // BLOCK))
 
         def zeros(dtype, shape=1):
@@ -214,22 +218,15 @@ class Anderson:
         """Launches the start of a loop of at most so many iterations, without history."""
         self.device.launch_serial(self.kernels.begin, [iterations, self.fresh, self.known, self.left, self.going])
 
-    def advance(
-        self, x_tilde: wp.array, increment: wp.array, free: wp.array, tolerance: float, relative_tolerance: float
-    ) -> None:
-        """Launches the update of x~ by the global step's increment, accelerated, and the decision whether to go on.
-
-        The loop ends at its cap of iterations, or once no vertex moves by more than `tolerance` (m), or by more than
-        `relative_tolerance` of what it moved in the first iteration.
-        """
-        k, device, scalar = self.kernels, self.device, self.real.scalar
+    def advance(self, x_tilde: wp.array, increment: wp.array, free: wp.array) -> None:
+        """Launches the update of x~ by the global step's increment, accelerated, and the decision whether to go on."""
+        k, device = self.kernels, self.device
         history = [self.f_last, self.g_last, self.df, self.dg]
         device.launch(
             k.push, self.blocks, [self.count, self.known, increment, free, x_tilde, *history, self.partial], grain=BLOCK
         )
-        limits = [scalar(tolerance), scalar(relative_tolerance)]
         counters = [self.fresh, self.known, self.left, self.done, self.going]
         device.launch_serial(
-            k.mix, [self.partial, self.blocks, *limits, self.gram, self.theta, self.norms, self.moved, *counters]
+            k.mix, [self.partial, self.blocks, *self.limits, self.gram, self.theta, self.norms, self.moved, *counters]
         )
         device.launch(k.combine, self.count, [self.known, self.theta, self.g_last, self.dg, x_tilde])

@@ -31,11 +31,12 @@ from pdipc.precision import Real, real
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneError
-from pdipc.scene.schema import Scene
+from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
-UNCOUPLED = ("a-jacobi", "direct")  # solvers for matrices without 3x3 contacts, and one that the host drives
+DEFAULT_SOLVER = {"barrier": "two-level", "paper": "a-jacobi"}
+UNFIT = {"barrier": ("a-jacobi", "direct"), "paper": ("direct",)}  # solvers without 3x3 contacts, and one that the host drives
 INNER_TOLERANCE = 0.2
 
 
@@ -84,6 +85,8 @@ class Settings:
     activation_distance: float
     slip_threshold: float  # m
     per_vertex_truncation: bool
+    method: str  # "barrier" or "paper"
+    restitution: float | None
     damping: float  # 1/s
     budget_ms: float | None  # of one sub-step
     margin: float  # m: how far a vertex may leave its swept box before candidates are listed again
@@ -94,7 +97,9 @@ class Model:
     """What stays constant: topology, masses, constraints, the global matrix and its solver, the contact surface.
 
     Arrays over all n vertices, simulated and kinematic: mass (n,) kg, 0 where kinematic; free (n,) 1 or 0;
-    half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness.
+    half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness;
+    body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
+    its body is stopped as a whole within a step (contact/restitution.py), 1 where kinematic.
     rigid: vertex ranges of the moving obstacles. triangles: (m, 3) int32, all surfaces.
     """
 
@@ -109,6 +114,8 @@ class Model:
     half_separation: wp.array
     friction: wp.array
     kappa: wp.array
+    body_mass: wp.array
+    rigidity: wp.array
     projector: constraints.Projector
     solver: Solver
     surface: surface.Surface
@@ -175,25 +182,36 @@ def build(scene: Scene, device: str | None = None) -> Model:
     mass = np.where(free, mass, 0.0)
     stiffness = constraints.stiffness_matrix(n, sets)
     matrix = stiffness + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
-    if sim.linear_solver in UNCOUPLED:
+    method, truncation = scene.contact.method, scene.contact.truncation
+    if truncation == "auto":
+        truncation = "global" if method == "paper" else "per_vertex"
+    name = DEFAULT_SOLVER[method] if sim.linear_solver == "auto" else sim.linear_solver
+    if name in UNFIT[method]:
         raise SceneError(
-            f'simulation.linear_solver is "{sim.linear_solver}", which cannot take the coupled contacts of a recorded step; '
-            f"it must be one of: {', '.join(name for name in SOLVERS if name not in UNCOUPLED)}"
+            f'simulation.linear_solver is "{name}", which cannot take the contacts of a recorded step with contact.method '
+            f'"{method}"; it must be one of: {", ".join(other for other in SOLVERS if other not in UNFIT[method])}'
         )
-    options = {"order": sim.solver_order} if sim.linear_solver == "matrix-powers" else {}
+    options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
     system = System(place, number, matrix, free)
-    solver = make_solver(
-        sim.linear_solver, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options
-    )
+    solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
 
-    per_vertex = {"friction": np.zeros(n), "half_separation": np.zeros(n), "kappa": np.zeros(n)}
+    per_vertex = {
+        "friction": np.zeros(n),
+        "half_separation": np.zeros(n),
+        "kappa": np.zeros(n),
+        "body_mass": np.zeros(n),
+        "rigidity": np.ones(n),
+    }
     for body in assembly.bodies:
         own = slice(body.first, body.last)
         per_vertex["friction"][own] = body.friction
         per_vertex["half_separation"][own] = body.half_separation
         if not body.kinematic:
             per_vertex["kappa"][own] = scene.contact.stiffness_scale * mass[own].mean() / (h * h)
-    per_vertex["kappa"][~free] = 0.0
+            per_vertex["body_mass"][own] = mass[own].sum()
+            crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / _speed_of_sound(body.material)
+            per_vertex["rigidity"][own] = h**2 / (h**2 + crossing**2)
+    per_vertex["kappa"][~free] = per_vertex["body_mass"][~free] = 0.0
 
     def upload(values: np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
@@ -210,7 +228,9 @@ def build(scene: Scene, device: str | None = None) -> Model:
             inner_tolerance=INNER_TOLERANCE,
             activation_distance=assembly.activation_distance,
             slip_threshold=scene.contact.friction_velocity * h,
-            per_vertex_truncation=scene.contact.truncation == "per_vertex",
+            per_vertex_truncation=truncation == "per_vertex",
+            method=method,
+            restitution=scene.contact.restitution,
             damping=sim.damping,
             budget_ms=None if sim.budget_ms is None else sim.budget_ms / sim.substeps,
             margin=0.5 * assembly.activation_distance,
@@ -223,6 +243,8 @@ def build(scene: Scene, device: str | None = None) -> Model:
         half_separation=upload(per_vertex["half_separation"]),
         friction=upload(per_vertex["friction"]),
         kappa=upload(per_vertex["kappa"]),
+        body_mass=upload(per_vertex["body_mass"]),
+        rigidity=upload(per_vertex["rigidity"]),
         projector=constraints.Projector(place, number, n, sets),
         solver=solver,
         surface=skin,
@@ -231,6 +253,14 @@ def build(scene: Scene, device: str | None = None) -> Model:
         rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
         triangles=assembly.triangles,
     )
+
+
+def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
+    """m/s, along the body."""
+    stiff, dense = (
+        (of.young_modulus, of.density) if isinstance(of, SolidMaterial) else (of.membrane_stiffness, of.areal_density)
+    )
+    return float(np.sqrt(stiff / dense))
 
 
 def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:

@@ -10,12 +10,16 @@ import warp as wp
 from pdipc.anderson import Anderson
 from pdipc.contact.candidates import Candidates
 from pdipc.contact.pairs import ActivePairs
+from pdipc.contact.paper import OUTER_SQUARED, PaperPairs
+from pdipc.contact.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.contact.truncation import Truncation
+from pdipc.energy_rate import EnergyRate
 from pdipc.model import Model, State
 from pdipc.parallel import Graph, Reducer
 from pdipc.precision import Real
 
 RESTRUCTURE_EVERY = 32  # steps between rebuilds of the culling's trees
+REBOUND_ITERATIONS, REBOUND_TOLERANCE = 200, 1e-5  # of the local-global iterations for restitution: most, and relative motion
 INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the outer tolerance
 
 STAGES = ("solver", "ccd", "barrier", "misc")
@@ -43,7 +47,8 @@ _CLOCK = """
 class StepResult:
     """The new state and what it took; the fields after `converged` carry the names of the paper's Table 1.
 
-    residual: m, the largest untruncated motion of the last outer iteration. smallest_gap: m beyond the minimum separation, inf
+    residual: m, the largest untruncated motion of the last outer iteration; in the paper's mode the norm of the truncated motion of
+    all vertices. smallest_gap: m beyond the minimum separation, inf
     without contact. milliseconds: solver, ccd (culling and CCD), barrier, misc.
     """
 
@@ -130,6 +135,11 @@ def kernels(real: Real) -> SimpleNamespace:
         moved_out[i] = moved
 
     @wp.kernel(module=module)
+    def measure_squared(first: int, x: wp.array(dtype=vec3), x_end: wp.array(dtype=vec3), moved_out: wp.array(dtype=scalar)):
+        i = first + wp.tid()
+        moved_out[i] = wp.length_sq(x_end[i] - x[i])
+
+    @wp.kernel(module=module)
     def decide(
         first: int,
         pairs: wp.array(dtype=wp.int32),
@@ -137,6 +147,8 @@ def kernels(real: Real) -> SimpleNamespace:
         overflow: wp.array(dtype=wp.int32),
         increment: wp.array(dtype=scalar),
         clock: wp.array(dtype=wp.float64),
+        as_printed: int,
+        committed: wp.array(dtype=scalar),
         tolerance: scalar,
         max_outer: int,
         budget_ms: wp.float64,
@@ -144,7 +156,8 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
-        """Line 16, on the untruncated motion: the truncated one becomes small because t_I does, converged or not."""
+        """Line 16. As printed it looks at the truncated motion, which becomes small because t_I does, converged or not; else at
+        the untruncated one."""
         status = int(RUNNING)
         residual = largest[0]
         free_flight = pairs[0] == 0 and increment[0] <= tolerance
@@ -158,7 +171,11 @@ def kernels(real: Real) -> SimpleNamespace:
             count[BARRIERS] = pairs[0]
             if passes[0] > 0:
                 count[TRUNCATIONS] = count[TRUNCATIONS] + 1
-            if passes[0] == 0 and (residual <= tolerance or free_flight):
+            settled = passes[0] == 0 and (residual <= tolerance or free_flight)
+            if as_printed != 0:
+                largest[0] = wp.sqrt(committed[0])
+                settled = largest[0] <= tolerance
+            if settled:
                 status = CONVERGED
             elif budget_ms > wp.float64(0.0) and clock[LAST] - clock[STARTED] > budget_ms:
                 status = OUT_OF_TIME
@@ -240,10 +257,9 @@ class Work:
         self.x_tilde, self.z = zeros(vec3), zeros(vec3)
         self.target, self.acceleration = zeros(vec3), zeros(vec3)
         self.force, self.rhs, self.increment = zeros(vec3), zeros(vec3), zeros(vec3)
-        self.moved, self.residual = zeros(scalar), zeros(scalar, 1)
+        self.moved, self.residual, self.committed = zeros(scalar), zeros(scalar, 1), zeros(scalar, 1)
         self.count, self.going = zeros(wp.int32, COUNTS), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(STAGES) + 2)
-        self.anderson = Anderson(device, real, n)
         self.largest = Reducer(device, real, n)
         settings = model.settings
         self.candidates = Candidates(
@@ -255,7 +271,20 @@ class Work:
             model.half_separation,
             settings.activation_distance,
         )
-        self.pairs = ActivePairs(device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        surfaces = (device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        self.as_printed = settings.method == "paper"
+        if self.as_printed:
+            rebound = {"mass": model.mass, "restitution": settings.restitution or 0.0, "h": settings.time_step}
+            self.pairs = PaperPairs(*surfaces, **rebound)
+            self.inner = EnergyRate(device, real, model.projector, self.pairs, self.x, self.z, model.mass)
+        else:
+            self.pairs = ActivePairs(*surfaces)
+            self.inner = Anderson(device, real, n, INNER_FRACTION * settings.outer_tolerance, settings.inner_tolerance)
+        self.restitution = None
+        if settings.restitution is not None and not self.as_printed:
+            masses = (model.mass, model.free, model.body_mass, model.rigidity)
+            self.restitution = Restitution(device, real, self.pairs, *masses, settings.restitution, settings.time_step)
+            self.parting = Anderson(device, real, n, 0.0, REBOUND_TOLERANCE)
         self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
         self._graphs: dict[str, Graph] = {}
         self._graphs_of: tuple[int, int] = (-1, -1)
@@ -315,6 +344,7 @@ class Work:
         device.copy(self.x, self.x_start)
         start = [self.x_start, self.v_start, self.a_start, self.acceleration, self.target, model.free]
         device.launch(k.predict, n, [*start, model.real.scalar(model.settings.time_step), self.z, self.x_tilde])
+        self.pairs.expect(self.x, self.x_tilde)
         self.candidates.check(self.x, self.x_tilde)
         device.when(self.candidates.needed, self._cover)
         self._mark("ccd")
@@ -323,9 +353,11 @@ class Work:
         """Lines 5 to 16."""
         device, k, n, s = self.model.device, self.kernels, self.model.vertex_count, self.model.settings
         self.pairs.freeze(self.candidates, self.x)  # line 5
+        if self.as_printed:  # the diagonal changes with the barriers only (Section 5)
+            self.model.solver.prepare(self.pairs)
         self._mark("barrier")
-        self.anderson.begin(s.inner_iterations)
-        device.loop(self.anderson.going, self._local_global)  # lines 7 to 12
+        self.inner.begin(s.inner_iterations)
+        device.loop(self.inner.going, self._local_global)  # lines 7 to 12
         device.launch(k.measure, n, [self.x, self.x_tilde, self.moved])
         self.largest.max(self.moved, self.residual)
         self._mark("solver")
@@ -333,8 +365,14 @@ class Work:
         device.when(self.candidates.needed, self._cover)  # line 13
         self.truncation.truncate(self.candidates, self.x, self.x_tilde)  # lines 14 and 15
         self._mark("ccd")
-        states = [self.pairs.count, self.truncation.passes, self.candidates.overflow, self.anderson.moved, self.clock]
-        limits = [self.model.real.scalar(s.outer_tolerance), s.max_outer, s.budget_ms or 0.0]
+        self.pairs.expect(self.x, self.x_tilde, self.truncation.fraction)
+        tolerance = s.outer_tolerance
+        if self.as_printed:
+            device.launch(k.measure_squared, n, [self.x, self.truncation.x_end, self.moved])
+            self.largest.sum(self.moved, self.committed)
+            tolerance = OUTER_SQUARED**0.5
+        states = [self.pairs.count, self.truncation.passes, self.candidates.overflow, self.inner.moved, self.clock]
+        limits = [int(self.as_printed), self.committed, self.model.real.scalar(tolerance), s.max_outer, s.budget_ms or 0.0]
         device.launch_serial(k.decide, [*states, *limits, self.residual, self.count, self.going])
         device.launch(k.commit, n, [self.count, self.truncation.x_end, self.x, self.x_tilde])
         self._mark("misc")
@@ -347,17 +385,39 @@ class Work:
         device.launch(k.inertia, model.vertex_count, inputs)
         model.projector.add_forces(self.x_tilde, self.rhs, self.force)
         self.pairs.linearize(self.x, self.x_tilde, self.x_start, self.rhs)
-        model.solver.solve(self.increment, self.rhs, self.pairs)
-        limits = (INNER_FRACTION * s.outer_tolerance, s.inner_tolerance)
-        self.anderson.advance(self.x_tilde, self.increment, model.free, *limits)
+        model.solver.solve(self.increment, self.rhs, self.pairs, prepared=self.as_printed)
+        self.inner.advance(self.x_tilde, self.increment, model.free)
 
     def finish(self) -> None:
-        """Line 18."""
+        """Line 18; with restitution, velocities are those that bodies part with."""
         model, k = self.model, self.kernels
         h = model.real.scalar(model.settings.time_step)
-        inputs = [self.x_start, self.x, h, self.v_start, self.a_start, self.v, self.a]
+        moved_to = self.x
+        if self.restitution is not None:
+            moved_to = self.restitution.x_now
+            self.restitution.aim(self.x_start, self.x, self.v_start)
+            model.device.when(self.restitution.needed, self._rebound)
+            self._mark("solver")
+        inputs = [self.x_start, moved_to, h, self.v_start, self.a_start, self.v, self.a]
         model.device.launch(k.finish, model.vertex_count, inputs)
         self._mark("misc")
+
+    def _rebound(self) -> None:
+        model, rebound = self.model, self.restitution
+        model.projector.add_forces(self.x, rebound.elastic, rebound.zero)
+        self.parting.begin(REBOUND_ITERATIONS)
+
+        def local_global() -> None:
+            rebound.inertia(self.x, self.force, self.increment)
+            model.projector.add_forces(rebound.x_now, self.rhs, self.force)
+            rebound.linearize(self.x_start, self.rhs)
+            model.solver.solve(self.increment, self.rhs, self.pairs)
+            self.parting.advance(rebound.x_now, self.increment, model.free)
+
+        model.device.loop(self.parting.going, local_global)
+        for x, place in ((self.x_start, ELASTIC_START), (self.x, ELASTIC_END)):
+            model.projector.energy(x, rebound.sums, place)
+        rebound.limit(self.x_start, self.x, self.v_start, self.acceleration)
 
     def _cover(self) -> None:
         self.candidates.cover(self.x, self.x_tilde, self.model.settings.margin)
@@ -380,7 +440,7 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
         wp.copy(work.x_start, state.positions)
         wp.copy(work.v_start, state.velocities)
         wp.copy(work.a_start, state.accelerations)
-        for counter in (work.anderson.done, model.solver.iterations):
+        for counter in (work.inner.done, model.solver.iterations):
             counter.zero_()
         motions = []
         if observe is None:
@@ -413,7 +473,7 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
         message=message,
         constraints=model.projector.count,
         barriers=int(count[BARRIERS]),
-        local_global=int(work.anderson.done.numpy()[0]),
+        local_global=int(work.inner.done.numpy()[0]),
         outer=int(count[OUTER]),
         linear_iterations=int(model.solver.iterations.numpy()[0]),
         truncations=int(count[TRUNCATIONS]),

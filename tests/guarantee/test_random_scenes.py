@@ -39,6 +39,10 @@ def scenes(draw):
     plate = {"name": "plate", "mesh": {"shape": "plane", "size": 1.0}, "rotation": [180.0, 0.0, 0.0]}
     plate |= {"translation": [0.0, 1.8, 0.0], "motion": {"velocity": [0.0, -draw(st.floats(0.0, 20.0)), 0.0]}}
     contact = {"activation_distance": draw(st.floats(5e-4, 5e-3)), "friction": draw(st.sampled_from([0.0, 0.5]))}
+    contact |= {
+        "method": draw(st.sampled_from(["barrier"] * 3 + ["paper"])),
+        "restitution": draw(st.sampled_from([None, 0.0, 0.7])),
+    }
     return scene(bodies, [floor(2.0), rod, plate], contact=contact, time_step=h, max_outer=OUTER)
 
 
@@ -66,13 +70,13 @@ def test_nothing_intersects_at_any_outer_iteration(random_scene):
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("truncation", ["per_vertex", "global"])
-def test_fast_block_meets_a_thin_rod(precision, truncation):
+@pytest.mark.parametrize(("method", "truncation"), [("barrier", "per_vertex"), ("barrier", "global"), ("paper", "global")])
+def test_fast_block_meets_a_thin_rod(precision, method, truncation):
     """A block of 5 cm cells at 20 m/s, 0.8 m a step, meets a rod of 1 mm: it must not jump over it."""
     block = solid("block", (0.2, 0.1, 0.1), (4, 2, 2), at=(0.01, 0.4, 0.0), velocity=(0, -20, 0))
     rod = {"name": "rod", "mesh": {"shape": "cylinder", "radius": 1e-3, "length": 0.6, "cells": [2, 1]}}
     rod |= {"rotation": [90.0, 0.0, 0.0]}
-    contact = {"activation_distance": 2e-3, "truncation": truncation}
+    contact = {"activation_distance": 2e-3, "truncation": truncation, "method": method}
     simulation = watched(scene([block], [rod], contact=contact, time_step=0.04, precision=precision, max_outer=15))
     body = simulation.model.assembly.bodies[0]
     for _ in range(4):

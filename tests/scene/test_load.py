@@ -26,7 +26,7 @@ mesh = { shape = "sphere", cells = 4 }
         ("titel = 'x'", r'titel = "x": unknown key; did you mean "title"\?'),
         ("[simulation]\ntime_step = 0", r"simulation.time_step = 0: must be greater than 0 \(Length h of a step, s"),
         ("[simulation]\nlinear_solver = 'lu'", r'linear_solver = "lu": must be .*pcg'),
-        ("[contact]\ntruncation = 'none'", r'contact.truncation = "none": must be .per_vertex. or .global.'),
+        ("[contact]\ntruncation = 'none'", r'contact.truncation = "none": must be .auto., .per_vertex. or .global.'),
         ("[[bodies]]\nname = 'a'\nmesh = 'a.obj'", r'bodies\[1\] \("a"\): needs kind = "solid" or "cloth"'),
         ("[[bodies]]\nkind = 'clth'\nmesh = 'a.obj'", r'bodies\[1\].kind = "clth": must be "solid" or "cloth"'),
         ("[[bodies]]\nname = 'ball'\nkind = 'cloth'\nmesh = 'a.obj'", r"names must be unique; used more than once: ball"),
@@ -107,7 +107,7 @@ def test_cloth_stiffness_follows_from_young_modulus_and_thickness():
 
 
 def test_solver_names_are_those_of_the_solvers():
-    assert typing.get_args(Simulation.model_fields["linear_solver"].annotation) == tuple(SOLVERS)
+    assert typing.get_args(Simulation.model_fields["linear_solver"].annotation) == ("auto", *SOLVERS)
 
 
 def test_the_reference_is_up_to_date(request):

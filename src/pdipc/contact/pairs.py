@@ -428,6 +428,9 @@ class ActivePairs:
             device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
         self._index()
 
+    def expect(self, x: wp.array, x_tilde: wp.array, fraction: wp.array | None = None) -> None:
+        """What is left of the motion x -> x~ of which each vertex made `fraction`: only the paper's mode needs to know."""
+
     def grow(self) -> bool:
         """Makes room for what overflowed; returns whether anything had to."""
         found = int(self.count.numpy()[1])
@@ -455,8 +458,12 @@ class ActivePairs:
         frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, self.coefficient]
         here = [self.slip_threshold, self.friction, self.hessian, self.force]
         self.device.launch_list(k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, *here])
+        self.gather(rhs)
+
+    def gather(self, rhs: wp.array) -> None:
+        """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
         inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
-        self.device.launch(k.gather, len(self.ends), [*inputs, rhs, self.diagonal])
+        self.device.launch(self.kernels.gather, len(self.ends), [*inputs, rhs, self.diagonal])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p, pair by pair and gathered per vertex. Recordable."""

@@ -71,13 +71,13 @@ class Simulation(Table):
     )
     inner_iterations: int = Field(default=30, ge=1, description="Most local-global iterations in an outer iteration.")
     linear_solver: Literal[
-        "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
-    ] = Field(default="two-level", description="Solver of the global step.")
+        "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
+    ] = Field(default="auto", description='Solver of the global step; "auto": two-level, with the paper\'s contact a-jacobi.')
     linear_iterations: int = Field(default=20, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
-    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that matrix-powers takes in one.")
+    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that a-jacobi and matrix-powers take in one.")
     budget_ms: Positive | None = Field(
         default=None,
         description="Time after which a step takes no further outer iteration, ms; results then depend on the machine.",
@@ -87,6 +87,11 @@ class Simulation(Table):
 class Contact(Table):
     """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
 
+    method: Literal["barrier", "paper"] = Field(
+        default="barrier",
+        description='"barrier": forces of the barrier, which converge to those of IPC. "paper": position targets as printed, Eq. (6), '
+        "to reproduce the paper; as safe, but less accurate, and without friction.",
+    )
     activation_distance: Positive | None = Field(
         default=None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
     )
@@ -103,9 +108,15 @@ class Contact(Table):
         default="auto",
         description="Culling: patches of the rest shape (Section 7.2), trees over primitives, or what measured faster (patches).",
     )
-    truncation: Literal["per_vertex", "global"] = Field(
-        default="per_vertex",
-        description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens.',
+    truncation: Literal["auto", "per_vertex", "global"] = Field(
+        default="auto",
+        description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens; '
+        '"auto": as the method does.',
+    )
+    restitution: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
+        default=None,
+        description="Part of the speed of approach that surfaces part with after an impact (eps of Eq. 6). Absent: what the barrier "
+        "gives back, 0 to 0.1 for most impacts and steps; with the paper's method 0.",
     )
 
 
