@@ -272,7 +272,7 @@ class Work:
             settings.activation_distance,
         )
         surfaces = (device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
-        self.as_printed = settings.method == "paper"
+        self.as_printed, self.truncated_tolerance = settings.method == "paper", OUTER_SQUARED**0.5
         if self.as_printed:
             rebound = {"mass": model.mass, "restitution": settings.restitution or 0.0, "h": settings.time_step}
             self.pairs = PaperPairs(*surfaces, **rebound)
@@ -370,7 +370,7 @@ class Work:
         if self.as_printed:
             device.launch(k.measure_squared, n, [self.x, self.truncation.x_end, self.moved])
             self.largest.sum(self.moved, self.committed)
-            tolerance = OUTER_SQUARED**0.5
+            tolerance = self.truncated_tolerance
         states = [self.pairs.count, self.truncation.passes, self.candidates.overflow, self.inner.moved, self.clock]
         limits = [int(self.as_printed), self.committed, self.model.real.scalar(tolerance), s.max_outer, s.budget_ms or 0.0]
         device.launch_serial(k.decide, [*states, *limits, self.residual, self.count, self.going])
