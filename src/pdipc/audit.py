@@ -1,11 +1,14 @@
-"""Energies, momenta and contact forces of a state: what a run prints, and what tests compare with mechanics."""
+"""Energies, momenta and contact forces of a state: what `pdipc audit` prints, and what tests compare with mechanics."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from pdipc.model import Model, State
+from pdipc.model import Model, State, build
+from pdipc.output.results import Run
+from pdipc.scene.schema import Scene
 from pdipc.step import Work
 
 
@@ -62,6 +65,12 @@ def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
     return force.numpy().astype(np.float64)
 
 
+def body_forces(model: Model, state: State, work: Work) -> dict[str, np.ndarray]:
+    """(3,) N by the name of a body or obstacle: the resultant of the contact forces on it."""
+    force = contact_forces(model, state, work)
+    return {body.name: force[body.first : body.last].sum(axis=0) for body in model.assembly.bodies}
+
+
 def vertex_areas(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(n,) m^2: a third of the triangles around each surface vertex, 0 inside."""
     corners = positions[triangles]
@@ -77,3 +86,21 @@ def contact_pressures(model: Model, state: State, work: Work) -> np.ndarray:
     force = np.linalg.norm(contact_forces(model, state, work), axis=1)
     area = vertex_areas(state.positions.numpy().astype(np.float64), model.triangles)
     return np.where(area > 0.0, force / np.maximum(area, 1e-300), 0.0)
+
+
+def replay(run: Run, frames: Iterable[int] | None = None) -> Iterator[tuple[Model, State, Work]]:
+    """Frames of a run, all by default, as states that the functions above take; on the CPU, in the precision of the run.
+
+    Velocities follow from the frames, as v = (x - x*) / h does in a step; with sub-steps they are the mean over a step.
+    """
+    scene = Scene.model_validate(run.scene)
+    scene.simulation.precision = run.meta.get("precision", scene.simulation.precision)
+    model = build(scene, "cpu")
+    work, start = Work(model), model.initial_state().arrays()
+    for frame in range(run.frame_count) if frames is None else frames:
+        frame = range(run.frame_count)[frame]
+        positions, velocities = run.positions(frame), start["velocities"]
+        if frame > 0:
+            velocities = (positions - run.positions(frame - 1)) / (run.times[frame] - run.times[frame - 1])
+        arrays = {"positions": positions, "velocities": velocities, "time": run.times[frame], "step": frame}
+        yield model, model.state_from({**start, **arrays}), work

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -16,6 +16,7 @@ import typer
 if TYPE_CHECKING:
     import numpy as np
 
+    from pdipc.output.render import Field
     from pdipc.output.results import Run
     from pdipc.scene.schema import Scene
 
@@ -38,6 +39,13 @@ class Format(StrEnum):
     ply = "ply"
     obj = "obj"
     vtk = "vtk"
+
+
+class Color(StrEnum):
+    """What colours the bodies of a picture."""
+
+    body = "body"
+    pressure = "pressure"
 
 
 class Precision(StrEnum):
@@ -135,6 +143,9 @@ def run(
     certify: Annotated[bool, typer.Option("--certify", help="Record every motion for `pdipc certify`.")] = False,
     solver: Annotated[str | None, typer.Option(help="Linear solver of the global step.")] = None,
     precision: Annotated[Precision | None, typer.Option(help="Working precision.")] = None,
+    audited: Annotated[
+        bool, typer.Option("--audit", help="Print energies and momenta at the end, as `pdipc audit` does.")
+    ] = False,
 ) -> None:
     """Simulate a scene into a folder."""
     from pdipc.output.results import open_run
@@ -187,6 +198,8 @@ def run(
         )
         raise typer.Exit(INTERRUPTED) from None
     _summary(folder, time.monotonic() - began)
+    if audited:
+        audit(folder)
 
 
 def load(scene: str) -> "Scene":
@@ -369,6 +382,56 @@ def check_scene(scene: SceneArgument) -> None:
     typer.echo(f"{scene}: can be simulated")
 
 
+@command()
+def audit(
+    folder: RunArgument,
+    out: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="Plot it: .png, .svg or .pdf.")] = None,
+    forces: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write contact forces, N, and pressures, Pa, at every vertex: .npz.")
+    ] = None,
+    every: Annotated[int, typer.Option(min=1, help="Takes every so many frames.")] = 1,
+) -> None:
+    """Energies, momenta and contact forces of a run, step by step."""
+    import numpy as np
+
+    from pdipc import audit as audits
+    from pdipc.output.results import open_run
+
+    opened = open_run(folder)
+    if forces is not None and forces.suffix != ".npz":
+        raise typer.BadParameter(f'"{forces}"; it must end in .npz', param_hint="--forces")
+    if out is not None and out.suffix not in (".png", ".svg", ".pdf"):
+        raise typer.BadParameter(f'"{out}"; it must end in one of: .png, .svg, .pdf', param_hint="--output")
+    taken = range(0, opened.frame_count, every)
+    typer.echo(_AUDIT_HEAD)
+    rows, resultants, at_vertices = [], [], []
+    for frame, state in zip(taken, audits.replay(opened, taken), strict=True):
+        row = audits.audit(*state)
+        momenta = " ".join(f"{value:11.4g}" for value in (*row.linear_momentum, *row.angular_momentum))
+        energies = " ".join(f"{value:11.4g}" for value in (row.kinetic, row.elastic, row.barrier, row.gravity, row.total))
+        typer.echo(f"{opened.records[frame]['step']:6} {energies} {momenta}")
+        rows.append(row)
+        resultants.append(audits.body_forces(*state))
+        if forces is not None:
+            at_vertices.append((audits.contact_forces(*state), audits.contact_pressures(*state)))
+    if forces is not None:
+        force, pressure = (np.array(values, dtype=np.float32) for values in zip(*at_vertices, strict=True))
+        np.savez_compressed(forces, time=opened.times[taken], force=force, pressure=pressure)
+        typer.echo(str(forces))
+    if out is not None:
+        from pdipc.output.plot import plot_audits
+
+        plot_audits(rows, resultants, out)
+        typer.echo(str(out))
+
+
+_AUDITED = ("kinetic", "elastic", "barrier", "gravity", "total", "px", "py", "pz", "Lx", "Ly", "Lz")
+_AUDIT_HEAD = (
+    "energies in J, momentum p in kg m/s, angular momentum L about the origin in kg m^2/s; without what is scripted\n"
+    + " ".join(["  step", *(f"{name:>11}" for name in _AUDITED)])
+)
+
+
 # --- looking ---
 
 
@@ -420,6 +483,11 @@ def render(
     frame: Annotated[int, typer.Option(help="Frame of a still picture; negative counts from the end.")] = -1,
     every: Annotated[int, typer.Option(min=1, help="Takes every so many frames into an animation.")] = 1,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size in pixels.")] = "1280x800",
+    view: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Direction from what is seen to the camera; y is up. Default: 0.7,0.42,1."),
+    ] = None,
+    color: Annotated[Color, typer.Option(help="A colour for each body, or the pressure of contact on it.")] = Color.body,
 ) -> None:
     """Make a picture or an animation of a run."""
     from pdipc.output import render as pictures
@@ -431,6 +499,12 @@ def render(
             raise ValueError
     except ValueError:
         raise typer.BadParameter(f'"{size}"; it must be like 1280x800', param_hint="--size") from None
+    try:
+        x, y, z = pictures.VIEW if view is None else (float(part) for part in view.split(","))
+        if not 0.0 < x * x + y * y + z * z < float("inf"):
+            raise ValueError
+    except ValueError:
+        raise typer.BadParameter(f'"{view}"; it must be like 0.7,0.42,1', param_hint="--view") from None
     suffix = out.suffix.lower()
     if suffix not in (*pictures.STILL, *pictures.MOVING):
         raise typer.BadParameter(
@@ -438,10 +512,24 @@ def render(
         )
     opened = open_run(folder)
     if suffix in pictures.STILL:
-        pictures.render(opened, frame, out, size=(width, height))
+        field = _pressure(opened, [frame]) if color is Color.pressure else None
+        pictures.render(opened, frame, out, size=(width, height), view=(x, y, z), field=field)
     else:
-        pictures.render_animation(opened, out, every=every, size=(width, height))
+        field = _pressure(opened, range(0, opened.frame_count, every)) if color is Color.pressure else None
+        pictures.render_animation(opened, out, every=every, size=(width, height), view=(x, y, z), field=field)
     typer.echo(str(out))
+
+
+def _pressure(opened: "Run", frames: "Iterable[int]") -> "Field":
+    """Contact pressure on the given frames; the last colour stands for what one in a hundred loaded vertices exceeds."""
+    import numpy as np
+
+    from pdipc.audit import contact_pressures, replay
+    from pdipc.output.render import Field
+
+    found = dict(zip(frames, (contact_pressures(*state) for state in replay(opened, frames)), strict=True))
+    loaded = np.concatenate([values[values > 0.0] for values in found.values()])
+    return Field("contact pressure, Pa", found.__getitem__, float(np.quantile(loaded, 0.99)) if len(loaded) else 1.0)
 
 
 @command()

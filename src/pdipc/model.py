@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -62,7 +63,7 @@ class State:
             accelerations=wp.clone(self.accelerations),
         )
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Any]:
         """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
         return {
             "positions": self.positions.numpy().copy(),
@@ -135,7 +136,7 @@ class Model:
         zero = np.zeros_like(a.positions)
         return self.state_from({"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "time": 0.0})
 
-    def state_from(self, arrays: dict[str, np.ndarray]) -> State:
+    def state_from(self, arrays: dict[str, Any]) -> State:
         """A state from NumPy arrays such as `State.arrays()` gives."""
 
         def upload(name: str) -> wp.array:
@@ -269,13 +270,13 @@ def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.
     sets, mass = [], np.zeros(n)
     for body in assembly.bodies:
         m = body.material
-        if body.kind == "solid":
+        if isinstance(m, SolidMaterial):
             strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
             sets.append(tet_strain.rest(x, body.tets, strain))
             if volume > 0.0:
                 sets.append(tet_volume.rest(x, body.tets, volume))
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
-        elif body.kind == "cloth":
+        elif isinstance(m, ClothMaterial):
             if m.membrane == "springs":
                 edges, stiffness = material.springs(x, body.triangles, m.membrane_stiffness)
                 sets.append(edge_length.rest(x, edges, stiffness))
@@ -285,7 +286,7 @@ def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.
                 if area > 0.0:
                     sets.append(triangle_area.rest(x, body.triangles, area))
             bending = curved_bending if m.bending == "curved" else quadratic_bending
-            if m.bending_stiffness > 0.0:
+            if m.bending_stiffness:
                 sets.append(bending.rest(x, body.triangles, m.bending_stiffness))
             mass += material.lumped_mass(n, body.triangles, m.areal_density * triangles.rest_shape(x, body.triangles)[1])
     for pin in assembly.pins:

@@ -73,7 +73,7 @@ def _meet_kernel() -> wp.Kernel:
     def meet_others(meeting: wp.array(dtype=wp.int32), threads: int):
         meet(meeting, threads)
 
-    return meet_others
+    return meet_others  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
 
 
 class Graph:
@@ -147,10 +147,7 @@ class Device:
                 wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp, record_cmd=True)
                 for low, high in itertools.pairwise(bounds)
             ]
-            others = [self._pool().submit(command.launch) for command in commands[1:]]
-            commands[0].launch()
-            for other in others:
-                other.result()
+            self._launch_together(commands)
 
     def launch_list(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
         """Runs `kernel(span, *inputs)` over a list of at most `capacity` entries whose length the kernel reads itself."""
@@ -170,10 +167,14 @@ class Device:
                 wp.launch(kernel, dim=1, inputs=[_span(part, parts, CPU_BLOCK), *inputs], device=self.warp, record_cmd=True)
                 for part in range(parts)
             ]
-            others = [self._pool().submit(command.launch) for command in commands[1:]]
-            commands[0].launch()
-            for other in others:
-                other.result()
+            self._launch_together(commands)
+
+    def _launch_together(self, commands: list[Any]) -> None:
+        """Runs recorded launches at once, one a thread."""
+        others = [self._pool().submit(command.launch) for command in commands[1:]]
+        commands[0].launch()
+        for other in others:
+            other.result()
 
     def launch_serial(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         """Runs `kernel(0, *inputs)` once, in one thread: the last step of a sum, a counter, a decision."""
@@ -284,7 +285,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             largest = wp.max(largest, partial[b])
         out[slot] = largest
 
-    return {"sum_blocks": sum_blocks, "sum_partials": sum_partials, "max_blocks": max_blocks, "max_partials": max_partials}
+    return {"sum_blocks": sum_blocks, "sum_partials": sum_partials, "max_blocks": max_blocks, "max_partials": max_partials}  # pyright: ignore[reportReturnType]
 
 
 class Reducer:

@@ -49,7 +49,7 @@ def kernel(module: wp.Module, name: str) -> Callable[[Callable], wp.Kernel]:
 
     def make(function: Callable) -> wp.Kernel:
         function.__qualname__ = name
-        return wp.kernel(function, module=module)
+        return wp.kernel(function, module=module)  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
 
     return make
 

@@ -457,8 +457,9 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
             break
         if not work.grow():  # a list was full: with more room, the step is taken again
             raise AssertionError("a list overflowed that had room")
-    for motion in motions:
-        observe(*motion)
+    if observe is not None:
+        for motion in motions:
+            observe(*motion)
     s, status = model.settings, count[STATUS]
     message = {
         CONVERGED: "",

@@ -148,6 +148,20 @@ def test_rotation_in_float32_is_as_good_as_float32_allows():
         np.testing.assert_allclose(p.T @ p, np.eye(3), atol=1e-5)
 
 
+def test_rotation_in_float32_of_inverted_matrices():
+    """The rotation may turn by rounding over s2 + s3 and no more, also where a SVD has to find it."""
+    rng = np.random.default_rng(9)
+    project = tet_strain.functions(real("float32")).project
+    for gap in (0.3, 0.1, 0.03, 0.01):
+        for _ in range(25):
+            u, v = rotation(rng), rotation(rng)
+            f = (u @ np.diag([1.0, 0.6, gap - 0.6]) @ v.T).astype(np.float32)
+            a, _, bt = np.linalg.svd(f.astype(np.float64))
+            nearest = a @ np.diag([1.0, 1.0, np.linalg.det(a @ bt)]) @ bt
+            p = np.array(project(wp.mat33(*f.ravel()))).reshape(3, 3)
+            assert np.abs(p - nearest).max() < 1e-6 + 3e-7 / gap
+
+
 def test_volume_projection_is_nearest_among_its_neighbours():
     """No matrix of determinant one around the projection is nearer: moves along the manifold do not get closer."""
     rng = np.random.default_rng(6)

@@ -53,4 +53,4 @@ def stiffness_matrix(count: int, sets: list[ConstraintSet]) -> scipy.sparse.csr_
         columns.append(np.tile(s.vertices, (1, corners)).ravel())
         values.append(np.einsum("e,eri,erj->eij", s.weight, s.gradient, s.gradient).ravel())
     triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return scipy.sparse.coo_matrix(triplets, shape=(count, count)).tocsr()
+    return scipy.sparse.csr_matrix(triplets, shape=(count, count))

@@ -18,6 +18,7 @@ import warp as wp
 
 from pdipc.precision import Real
 
+REFINEMENTS = 2  # of the SVD's rotation
 NEWTON_STEPS = 16  # at most; three or four are usual
 DEGENERATE = {"float32": 2.0e-2, "float64": 1.0e-4}  # of |F|^3: below, an SVD takes over
 
@@ -65,6 +66,22 @@ def functions(real: Real) -> SimpleNamespace:
         return orthonormalized(orthonormalized(r))
 
     @wp.func
+    def refined(f: mat33, rotation: mat33) -> mat33:
+        """Newton's method for R^T F symmetric, from a rotation near that: Warp's SVD in float32 is good to 1e-3 only."""
+        r = rotation
+        for _ in range(REFINEMENTS):
+            s = wp.transpose(r) * f
+            asymmetry = vec3(s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1])
+            h = scalar(-0.5) * (s + wp.transpose(s))
+            trace = wp.trace(s)
+            for i in range(3):
+                h[i, i] += trace
+            turn = cofactor(h) * asymmetry / wp.determinant(h)
+            if wp.length(turn) < scalar(0.3):  # not where the nearest rotation is all but undetermined
+                r = orthonormalized(orthonormalized(r + r * wp.skew(turn)))
+        return r
+
+    @wp.func
     def nearest_rotation(f: mat33) -> mat33:
         """argmin over rotations R of |F - R|_F; the identity for F = 0."""
         size_sq = wp.ddot(f, f)
@@ -94,13 +111,14 @@ def functions(real: Real) -> SimpleNamespace:
         i2 = scalar(0.5) * (i1 * i1 - scalar(1.0))
         divisor = i1 * i2 - d
         if settled_at == 0 or not (divisor > degenerate):
-            return rotation_by_svd(g)
+            return refined(g, rotation_by_svd(g))
         r = (i1 * c + (i1 * i1 - i2) * g - g * (wp.transpose(g) * g)) / divisor
         return orthonormalized(r)
 
     return SimpleNamespace(
         cofactor=cofactor,
         orthonormalized=orthonormalized,
+        refined=refined,
         rotation_by_svd=rotation_by_svd,
         nearest_rotation=nearest_rotation,
     )

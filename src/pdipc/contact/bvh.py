@@ -207,7 +207,8 @@ class Bvh:
         n, m, k = len(surface.body_of_vertex), len(surface.triangles), len(surface.edges)
 
         def boxes(count: int) -> tuple[wp.array, wp.array]:
-            return tuple(wp.zeros(count, dtype=wp.vec3, device=device.warp) for _ in range(2))
+            low, high = (wp.zeros(count, dtype=wp.vec3, device=device.warp) for _ in range(2))
+            return low, high
 
         self.of_vertices, self.of_triangles, self.of_edges = boxes(n), boxes(m), boxes(k)
         self.vertex_triangle = sweep.PairList(device, self.sweep, len(surface.vertices), overflow)

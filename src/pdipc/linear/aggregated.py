@@ -180,7 +180,7 @@ class AJacobi(Solver):
         b.sort_indices()
         inverse = np.where(system.free, 1.0 / np.where(system.free, system.matrix.diagonal(), 1.0), 0.0)
         if split is not None:
-            split = tuple(sp.csr_matrix(-part) for part in split)
+            split = (sp.csr_matrix(-split[0]), sp.csr_matrix(-split[1]))
         self.products = AProducts(b, coefficients, inverse, split, drop, memory_limit)
         self.dropped = self.products.dropped
         self._upload(system)

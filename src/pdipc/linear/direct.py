@@ -44,6 +44,7 @@ class Direct(Solver):
             if contact is None or free.size == 0:
                 return np.zeros((free.size, 3))
             if contact.apply is None:
+                assert contact.scalar is not None  # it is the whole contribution, then
                 return contact.scalar.numpy()[free, None] * p[free]
             self._p.assign(np.concatenate([p, np.zeros((len(self._p) - n, 3))]).astype(self.real.numpy))
             self._y.zero_()

@@ -42,7 +42,7 @@ class Sor(Solver):
     def __init__(self, system: System, tolerance: float, max_iterations: int, omega: float | None = None):
         super().__init__(system, tolerance, max_iterations)
         if omega is None:
-            omega = 2.0 / (1.0 + np.sqrt(1.0 - jacobi.weight_and_radius(system)[1] ** 2))
+            omega = float(2.0 / (1.0 + np.sqrt(1.0 - jacobi.weight_and_radius(system)[1] ** 2)))
         if not 0.0 < omega < 2.0:
             raise ValueError(f"omega is {omega}; it must lie between 0 and 2")
         self.omega = omega

@@ -1,5 +1,7 @@
 """Pictures and animations of a run, drawn off-screen with PyVista."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ LARGE = 2.0  # an obstacle of more than so many times the size of what moves is 
 REACH = 5.0  # a floor is drawn up to so many radii of what moves
 OCCLUDERS = 4000  # triangles, whole or quartered, that are taken to shade a floor
 VIEW = (0.7, 0.42, 1.0)  # from the middle of the bodies towards the camera
+FIELD = "field"
+COLORS = "viridis"  # of a field on the bodies
 ANGLE = 28.0  # degrees: vertical field of view
 FASTEST = 50.0  # frames a second that players show
 
@@ -28,9 +32,13 @@ def render(
     path: str | Path,
     size: tuple[int, int] = (1280, 800),
     view: tuple[float, float, float] = VIEW,
+    field: "Field | None" = None,
 ) -> None:
-    """Draws one frame into `path`, .png or .jpg. size: pixels. view: direction from what is seen to the camera; y is up."""
-    picture = Picture(run, [frame], size, view)
+    """Draws one frame into `path`, .png or .jpg. size: pixels. view: direction from what is seen to the camera; y is up.
+
+    field: what colours the bodies, in place of a colour each.
+    """
+    picture = Picture(run, [frame], size, view, field)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     try:
         picture.plotter.screenshot(str(path))
@@ -44,6 +52,7 @@ def render_animation(
     every: int = 1,
     size: tuple[int, int] = (1280, 800),
     view: tuple[float, float, float] = VIEW,
+    field: "Field | None" = None,
 ) -> None:
     """Draws every so many frames into `path`, .gif or .mp4; it plays as fast as what happened, with at most 50 frames a second.
 
@@ -56,7 +65,7 @@ def render_animation(
     rate = (len(frames) - 1) / float(run.times[frames[-1]]) if len(frames) > 1 else 1.0
     skip = max(1, round(rate / FASTEST))
     frames, rate = frames[::skip], rate / skip
-    picture = Picture(run, frames, size, view)
+    picture = Picture(run, frames, size, view, field)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         if path.suffix.lower() == ".gif":
@@ -70,13 +79,29 @@ def render_animation(
         picture.plotter.close()
 
 
+@dataclass
+class Field:
+    """A number at each vertex, shown as colours. values(frame): (n,); top: what the last colour stands for."""
+
+    title: str
+    values: Callable[[int], np.ndarray]
+    top: float
+
+
 class Picture:
     """The bodies of a run, framed so that they stay in sight in all of `frames`; shows the first."""
 
-    def __init__(self, run: Run, frames: list[int], size: tuple[int, int], view: tuple[float, float, float]):
+    def __init__(
+        self,
+        run: Run,
+        frames: list[int],
+        size: tuple[int, int],
+        view: tuple[float, float, float],
+        field: Field | None = None,
+    ):
         import pyvista
 
-        self.run = run
+        self.run, self.field = run, field
         self.plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
         self.plotter.set_background(BACKGROUND)
         low, high = self._bounds(frames)
@@ -102,8 +127,11 @@ class Picture:
     def show(self, frame: int) -> None:
         """Moves the bodies to where they are in `frame`."""
         positions = self.run.positions(frame)
+        values = self.field.values(frame) if self.field else None
         for body in self.bodies:
             body.move(positions)
+            if values is not None and isinstance(body, _Body) and body.colored:
+                body.mesh[FIELD] = values[body.vertices]
 
     def _bounds(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Box around the bodies, and the obstacles that are not much larger, over at most 30 of the frames."""
@@ -164,9 +192,16 @@ class _Body:
         if kind != "cloth":
             self.mesh = self.mesh.compute_normals(split_vertices=True, feature_angle=SHARP_EDGE, consistent_normals=False)
         self.vertices = np.asarray(self.mesh["vertex"])
+        field = None if kind == "obstacle" else picture.field
+        self.colored = field is not None
+        look: dict = {"color": color}
+        if field is not None:
+            self.mesh[FIELD] = np.zeros(len(self.vertices))
+            bar = {"title": field.title, "color": "black", "n_labels": 3, "fmt": "%.2g", "width": 0.5, "position_x": 0.25}
+            look = {"scalars": FIELD, "clim": (0.0, field.top), "cmap": COLORS, "scalar_bar_args": bar}
         picture.plotter.add_mesh(
             self.mesh,
-            color=color,
+            **look,
             opacity=opacity,
             smooth_shading=True,
             ambient=0.22,
