@@ -59,7 +59,7 @@ def motion(simulation, steps):
     ("make_scene", "steps", "tolerances"),
     [
         (falling_box, 100, (1e-5, 1e-6, 1e-8)),
-        (cloth_on_a_sphere, 30, (1e-5, 1e-6, 1e-8)),
+        (cloth_on_a_sphere, 30, (1e-6, 1e-7, 1e-8)),
         (cloth_on_a_sphere, 100, (1e-7, 1e-8)),
     ],
 )
