@@ -118,7 +118,11 @@ def progress(label: str, total: int) -> Iterator[Callable[[int, str], None]]:
 
 
 def pictures(
-    run: Run, frames: Iterable[int], size: tuple[int, int], view: tuple[float, float, float], framed: Iterable[int] | None = None
+    run: Run,
+    frames: Iterable[int],
+    size: tuple[int, int],
+    view: tuple[float, float, float],
+    framed: Iterable[int] | None = None,
 ) -> list[np.ndarray]:
     """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`)."""
     frames = list(frames)

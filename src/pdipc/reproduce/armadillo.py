@@ -88,7 +88,14 @@ def stand_in() -> Scene:
 
 
 def _drag(body: str, center: tuple, radius: float, force: tuple, start: float, end: float) -> dict:
-    return {"kind": "vertices", "body": body, "select": {"sphere": (center, radius)}, "force": force, "start": start, "end": end}
+    return {
+        "kind": "vertices",
+        "body": body,
+        "select": {"sphere": (center, radius)},
+        "force": force,
+        "start": start,
+        "end": end,
+    }
 
 
 def row(assembly: Assembly, run: Run) -> tuple[str, ...]:
