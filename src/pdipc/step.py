@@ -191,14 +191,16 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         count: wp.array(dtype=wp.int32),
         x_end: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
         x_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
     ):
-        """The truncated motion is made."""
+        """The truncated motion is made. Scripted vertices go on to their target in the next outer iteration."""
         i = first + wp.tid()
         if count[STATUS] < OVERFLOW:
             x_out[i] = x_end[i]
-            x_tilde_out[i] = x_end[i]
+            x_tilde_out[i] = wp.where(free[i] > scalar(0.0), x_end[i], target[i])
 
     @wp.kernel(module=module)
     def finish(
@@ -374,7 +376,8 @@ class Work:
         states = [self.pairs.count, self.truncation.passes, self.candidates.overflow, self.inner.moved, self.clock]
         limits = [int(self.as_printed), self.committed, self.model.real.scalar(tolerance), s.max_outer, s.budget_ms or 0.0]
         device.launch_serial(k.decide, [*states, *limits, self.residual, self.count, self.going])
-        device.launch(k.commit, n, [self.count, self.truncation.x_end, self.x, self.x_tilde])
+        inputs = [self.count, self.truncation.x_end, self.target, self.model.free]
+        device.launch(k.commit, n, [*inputs, self.x, self.x_tilde])
         self._mark("misc")
 
     def _local_global(self) -> None:

@@ -1,0 +1,137 @@
+"""The figures of simulations in their small size: files are written, and what the pictures show is so."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib", reason="needs matplotlib (extra: pictures)")
+pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
+
+from pdipc.output.results import open_run
+from pdipc.parallel import Device
+from pdipc.reproduce import _common, armadillo, fig9, fig10, fig12
+from pdipc.scene import meshes
+
+
+@pytest.fixture(autouse=True)
+def generated(monkeypatch, tmp_path):
+    """Small figures need no data; here there is none."""
+    monkeypatch.setenv("PDIPC_DATA", str(tmp_path / "none"))
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def check_files(picture, told):
+    """The PNG, the CSV and the sentence, which is printed last."""
+    assert picture.stat().st_size > 20_000
+    assert picture.with_suffix(".csv").is_file()
+    sentence = picture.with_suffix(".txt").read_text()
+    assert sentence.startswith("Paper, ") and "Here" in sentence
+    assert told.endswith(sentence)
+
+
+@pytest.mark.parametrize("capsules", [_common.DINOSAUR, _common.BIPED])
+def test_generated_bodies(capsules):
+    """Closed, of positive tets, in one piece and free of intersections."""
+    body = _common.creature(capsules, 0.09)
+    mesh = meshes.Mesh.of_tets(body["vertices"], body["tets"])
+    assert meshes.tet_volumes(mesh.vertices, mesh.tets).min() > 0.0
+    assert len(_common.find_intersections(mesh.vertices, mesh.triangles)) == 0
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(1.0, abs=0.2)
+
+
+def test_patches_cover_every_triangle_once_and_boxes_hold_them():
+    body = _common.creature(_common.BIPED, 0.09)
+    mesh = meshes.Mesh.of_tets(body["vertices"], body["tets"])
+    culling, patch = fig9.patches_of(mesh.vertices, mesh.triangles, Device("cpu", threads=1))
+    listed = culling.surface.members[2]
+    assert len(patch) == len(listed) == len(mesh.triangles)
+    assert len(np.unique(np.sort(listed, axis=1), axis=0)) == len(mesh.triangles)
+    low, high = fig9.boxes(culling, culling.tree.leaves.bit_length() - 1)
+    corners = mesh.vertices[listed]
+    assert np.all(corners >= low[patch][:, None] - 1e-6) and np.all(corners <= high[patch][:, None] + 1e-6)
+    for level in range(culling.tree.leaves.bit_length()):  # every level holds the whole body
+        low, high = fig9.boxes(culling, level)
+        np.testing.assert_allclose(
+            [low.min(axis=0), high.max(axis=0)], [mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], atol=1e-6
+        )
+
+
+def test_fig9(tmp_path, capsys):
+    check_files(fig9.run(tmp_path, small=True, device="cpu"), capsys.readouterr().out)
+    counts = [int(row["boxes"]) for row in rows(tmp_path / "fig9.csv")]
+    assert counts[0] == 1 and counts == sorted(counts)
+    volumes = [float(row["total_volume"]) for row in rows(tmp_path / "fig9.csv")]
+    assert volumes[-1] < 0.7 * volumes[0]
+
+
+def test_fig10(tmp_path, capsys):
+    """Plain PD is held by the rods and passes the thin ones; ours is held by both and never intersects."""
+    pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
+    check_files(fig10.run(tmp_path, small=True, device="cpu"), capsys.readouterr().out)
+    found = rows(tmp_path / "fig10.csv")
+    last = {(row["rods"], row["method"]): float(row["part_below_the_rods"]) for row in found}
+    assert last["thin rods", "plain PD"] > 0.9
+    assert last["rods", "plain PD"] < 0.1
+    assert max(last["rods", "this package"], last["thin rods", "this package"]) < 0.2
+    crossing = {(row["rods"], row["method"]): 0 for row in found}
+    for row in found:
+        crossing[row["rods"], row["method"]] += int(row["intersections"])
+    assert crossing["rods", "this package"] == crossing["thin rods", "this package"] == 0
+    assert crossing["thin rods", "plain PD"] > 0
+
+
+def test_fig12(tmp_path, capsys):
+    """Nothing intersects, boards arrive, and both methods flatten the body alike."""
+    pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
+    pytest.importorskip("ipctk", reason="needs ipctk (extra: benchmarks)")
+    check_files(fig12.run(tmp_path, small=True, device="cpu"), capsys.readouterr().out)
+    found = rows(tmp_path / "fig12.csv")
+    assert len(found) == 2 * fig12.SMALL_STEPS
+    assert all(int(row["intersections"]) == 0 for row in found)
+    assert all(row["converged"] == "True" for row in found)
+    ours, theirs = open_run(tmp_path / "ours"), open_run(tmp_path / "ipc")
+    x, y = ours.positions(-1), theirs.positions(-1)
+    size = np.linalg.norm(np.ptp(x[~ours.scripted], axis=0))
+    np.testing.assert_allclose(x[ours.scripted], y[ours.scripted], atol=1e-9)
+    assert np.linalg.norm(x - y, axis=1).mean() < 3e-3 * size
+
+
+def test_armadillo(tmp_path, capsys):
+    """The stand-in says that it is one; cloth comes to lie on the body, and nothing intersects."""
+    picture = armadillo.run(tmp_path, small=True, device="cpu")
+    told = capsys.readouterr().out
+    check_files(picture, told)
+    assert "stand-in" in told
+    paper, here = rows(tmp_path / "armadillo.csv")
+    assert paper["outer"] == "10" and paper["FPS"] == "19.4 to 112.0"
+    assert here["bodies"] == "3" and int(here["barriers"]) > 0
+    steps = rows(tmp_path / "armadillo_steps.csv")
+    assert all(int(row["intersections"]) == 0 for row in steps)
+    assert max(int(row["barriers"]) for row in steps) > 50
+
+
+def test_a_stopped_figure_goes_on_where_it_was(tmp_path):
+    """The same bits as without a stop; a run of another scene is begun anew."""
+    scene = armadillo.stand_in()
+    scene.simulation.steps = 3
+    whole = _common.simulated(scene, tmp_path / "whole", "whole", "cpu").positions(-1)
+    part = tmp_path / "part"
+    shutil.copytree(tmp_path / "whole", part)
+    (part / "checkpoints" / "000003.npz").unlink()
+    again = _common.simulated(scene, part, "part", "cpu")
+    assert again.frame_count == 4
+    np.testing.assert_array_equal(again.positions(-1), whole)
+    scene.simulation.steps = 2
+    assert _common.simulated(scene, part, "other", "cpu").frame_count == 3
+
+
+def test_baselines_are_asked_for_where_there_is_no_checkout(tmp_path, monkeypatch):
+    monkeypatch.setattr(_common, "CHECKOUT", tmp_path)
+    with pytest.raises(FileNotFoundError, match="checkout"):
+        _common.baseline("ipc")
