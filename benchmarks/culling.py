@@ -114,7 +114,10 @@ def main() -> None:
     for name, exponent in exponents.items():
         print(f"{name:36} time ~ triangles^{exponent:.2f}")
     if not options.small:
-        cpu = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), "unknown")
+        cpu = next(
+            (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line),
+            "unknown",
+        )
         report = {"machine": f"{cpu}, {os.cpu_count()} cores", "load_average": os.getloadavg()[0], "exponents": exponents}
         out = Path(__file__).parent / "results" / "culling.json"
         out.write_text(json.dumps(report | {"rows": rows}, indent=1))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pdipc.parallel import Device
-from pdipc.precision import real
+from pdipc.precision import Real, real
 from pdipc.reproduce.fig7 import Run, describe, loads, table_cloth
 
 # An iteration of order l expands the series by l terms. The first variant is what the others are measured by.
@@ -22,6 +22,24 @@ SMALL = (12, 18)
 SIDES = {"cpu": (41, 71, 100, 183), "cuda": (41, 71, 100, 183, 316, 577)}  # 5K to 100K DOF, to 1M DOF on CUDA
 
 
+def measure(side: int, place: Device, precision: Real) -> list[tuple[int, str, float, float, int]]:
+    """Of a cloth of side x side vertices and each variant: DOF, label, terms a second, that over Jacobi's, bytes."""
+    system, mass, split = table_cloth(side, place, precision)
+    b = loads(system, mass)["gravity"]
+    rows, base = [], None
+    for label, (name, options) in VARIANTS.items():
+        extra = {"accelerated": False} if name == "a-jacobi" else {}
+        extra |= {"split": split} if "Eq. 16" in label else {}
+        try:
+            variant = Run(system, b, name, options | extra)
+        except ValueError:  # A-products too large for the memory: no bar
+            continue
+        terms = options["order"] / variant.per_iteration()[1]
+        base = terms if base is None else base
+        rows.append((3 * system.count, label, terms, terms / base, variant.solver.bytes))
+    return rows
+
+
 def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> Path:
     """Writes fig8.csv and fig8.png to `out_dir`; small: two cloths of a few hundred vertices. Returns the path of the PNG."""
     import matplotlib
@@ -33,22 +51,8 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     out.mkdir(parents=True, exist_ok=True)
     place = Device(device)
     precision = real("float32" if place.is_cuda else "float64")
-    rows = []
-    for side in SMALL if small else SIDES["cuda" if place.is_cuda else "cpu"]:
-        system, mass, split = table_cloth(side, place, precision)
-        b = loads(system, mass)["gravity"]
-        base = None
-        for label, (name, options) in VARIANTS.items():
-            extra = {"accelerated": False} if name == "a-jacobi" else {}
-            extra |= {"split": split} if "Eq. 16" in label else {}
-            try:
-                variant = Run(system, b, name, options | extra)
-            except ValueError:  # A-products too large for the memory: no bar
-                continue
-            terms = options["order"] / variant.per_iteration()[1]
-            base = terms if base is None else base
-            memory = variant.solver.bytes
-            rows.append((3 * system.count, label, terms, terms / base, memory))
+    sides = SMALL if small else SIDES["cuda" if place.is_cuda else "cpu"]
+    rows = [row for side in sides for row in measure(side, place, precision)]
     _draw(rows, place, precision.name).savefig(out / "fig8.png", dpi=110)
     plt.close("all")
     with (out / "fig8.csv").open("w", newline="") as file:
