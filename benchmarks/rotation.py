@@ -1,11 +1,10 @@
 """Nearest rotation of a 3x3 matrix: constraints/rotation.py, Warp's svd3 and NumPy's batched SVD: `python benchmarks/rotation.py`.
 
-One thread. Prints ns per matrix (median and quartiles over repeats) and the largest error of an entry against a float64 SVD, and
-writes benchmarks/results/rotation.json with the machine named.
+One thread. Prints ns of CPU time per matrix (median and quartiles over repeats) and the largest error of an entry against a
+float64 SVD, and writes benchmarks/results/rotation.json with the machine named.
 
-The nearest rotation of a flat or an inverted matrix turns by much where the matrix moves by little: over the sum of the two
-smallest singular values, the smallest one negative where inverted. `rounded` is therefore what a SVD in float64 makes of the
-matrix and of the same matrix moved by a unit roundoff of the working precision: no method can be more accurate than that.
+Where two singular values nearly cancel, the smallest negative for inverted matrices, the nearest rotation turns by much when the
+matrix moves by little. `rounded` is how far it goes when each entry moves by a unit roundoff: no method can do much better.
 """
 
 import argparse
@@ -95,15 +94,16 @@ def measure(precision: str, count: int, repeats: int) -> list[dict]:
         for name in (*methods, "numpy"):
             times = []
             for _ in range(repeats + 1):  # the first one compiles
-                start = time.perf_counter()
+                start = time.process_time()
                 found = by_numpy(rounded) if name == "numpy" else methods[name](given, out)
-                times.append(1e9 * (time.perf_counter() - start) / count)
+                times.append(1e9 * (time.process_time() - start) / count)
             low, middle, high = statistics.quantiles(times[1:], n=4)
             error = float(np.abs(found - expected).max())
             row = {"precision": precision, "matrices": kind, "method": name, "ns": middle, "quartiles_ns": [low, high]}
             rows.append({**row, "largest_error": error, "rounded": unavoidable})
             print(
-                f"{precision:9} {kind:14} {name:8} {middle:9.1f} ns ({low:.1f} to {high:.1f})  error {error:.1e}, rounded {unavoidable:.1e}",
+                f"{precision:9} {kind:14} {name:8} {middle:9.1f} ns ({low:.1f} to {high:.1f})  "
+                f"error {error:.1e}, rounded {unavoidable:.1e}",
                 flush=True,
             )
     return rows

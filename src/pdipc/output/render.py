@@ -16,7 +16,7 @@ OPACITY = 0.3  # of obstacles above the bodies, which would hide them
 FLOOR = "#dde1e6"
 BACKGROUND = "#f8f9fb"
 SHARP_EDGE = 40.0  # degrees: sharper edges are not shaded smoothly
-LARGE = 2.0  # an obstacle of more than so many times the size of what moves is not framed
+LARGE = 2.5  # an obstacle of more than so many times the size of what moves is not framed
 REACH = 5.0  # a floor is drawn up to so many radii of what moves
 OCCLUDERS = 4000  # triangles, whole or quartered, that are taken to shade a floor
 VIEW = (0.7, 0.42, 1.0)  # from the middle of the bodies towards the camera
@@ -104,7 +104,8 @@ class Picture:
         self.run, self.field = run, field
         self.plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
         self.plotter.set_background(BACKGROUND)
-        low, high = self._bounds(frames)
+        seen = self._framed(frames)
+        low, high = seen.min(axis=0), seen.max(axis=0)
         self.center, self.radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)) or 1.0
         self.bodies: list[_Body | _Floor] = []
         start = run.positions(frames[0])
@@ -119,7 +120,7 @@ class Picture:
                 covers = kind == "obstacle" and start[vertices, 1].min() > self.center[1]
                 self.bodies.append(_Body(self, start, vertices, triangles, kind, color, OPACITY if covers else 1.0))
         self._light()
-        self._look(np.array([low, high]), np.array(view, dtype=float), size[0] / size[1])
+        self._look(seen, np.array(view, dtype=float), size[0] / size[1])
         self.plotter.enable_anti_aliasing("ssaa")
         self.plotter.enable_ssao(radius=0.12 * self.radius, bias=0.004 * self.radius, kernel_size=96, blur=True)
         self.show(frames[0])
@@ -133,29 +134,24 @@ class Picture:
             if values is not None and isinstance(body, _Body) and body.colored:
                 body.mesh[FIELD] = values[body.vertices]
 
-    def _bounds(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Box around the bodies, and the obstacles that are not much larger, over at most 30 of the frames."""
+    def _framed(self, frames: list[int]) -> np.ndarray:
+        """(k, 3): points of the bodies, and of the obstacles that are not much larger, over at most 30 of the frames."""
+        kinds, of_vertex = self.run.body_kinds, self.run.topology["body_of_vertex"]
         sampled = [self.run.positions(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, 30).astype(int))]
-        boxes = [self._box(sampled, body) for body in range(len(self.run.body_kinds))]
-        moving = [box for box, kind in zip(boxes, self.run.body_kinds, strict=True) if kind != "obstacle"] or boxes
+        points = [np.concatenate([positions[of_vertex == body] for positions in sampled]) for body in range(len(kinds))]
+        moving = [own for own, kind in zip(points, kinds, strict=True) if kind != "obstacle"] or points
         size = LARGE * np.linalg.norm(np.ptp(np.concatenate(moving), axis=0))
-        framed = np.concatenate(moving + [box for box in boxes if np.linalg.norm(box[1] - box[0]) < size])
-        return framed.min(axis=0), framed.max(axis=0)
+        return np.concatenate(moving + [own for own in points if np.linalg.norm(np.ptp(own, axis=0)) < size])
 
-    def _box(self, sampled: list[np.ndarray], body: int) -> np.ndarray:
-        own = self.run.topology["body_of_vertex"] == body
-        points = np.concatenate([positions[own] for positions in sampled])
-        return np.array([points.min(axis=0), points.max(axis=0)])
-
-    def _look(self, box: np.ndarray, view: np.ndarray, aspect: float) -> None:
-        """The camera as near as all corners of the box allow."""
+    def _look(self, seen: np.ndarray, view: np.ndarray, aspect: float) -> None:
+        """The camera as near as all points seen (k, 3) allow."""
         view /= np.linalg.norm(view)
         right = np.cross([0.0, 1.0, 0.0], view)
         right = right / np.linalg.norm(right) if right.any() else np.array([1.0, 0.0, 0.0])
         up = np.cross(view, right)
-        corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3) - self.center
+        away = seen - self.center
         slope = np.tan(np.radians(ANGLE / 2)) * 0.9
-        needed = np.maximum(np.abs(corners @ up) / slope, np.abs(corners @ right) / (slope * aspect)) + corners @ view
+        needed = np.maximum(np.abs(away @ up) / slope, np.abs(away @ right) / (slope * aspect)) + away @ view
         camera = self.plotter.camera
         camera.focal_point = self.center
         camera.position = self.center + needed.max() * view
@@ -197,12 +193,13 @@ class _Body:
         look: dict = {"color": color}
         if field is not None:
             self.mesh[FIELD] = np.zeros(len(self.vertices))
-            bar = {"title": field.title, "color": "black", "n_labels": 3, "fmt": "%.2g", "width": 0.5, "position_x": 0.25}
+            bar = {"title": field.title, "color": "black", "n_labels": 2, "fmt": "%.2g", "width": 0.5, "position_x": 0.25}
             look = {"scalars": FIELD, "clim": (0.0, field.top), "cmap": COLORS, "scalar_bar_args": bar}
         picture.plotter.add_mesh(
             self.mesh,
             **look,
             opacity=opacity,
+            culling="back" if opacity < 1.0 else False,  # unsorted faces behind others would show in places
             smooth_shading=True,
             ambient=0.22,
             diffuse=0.85,
