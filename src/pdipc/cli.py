@@ -90,6 +90,7 @@ EXTRAS = {
     "viewer": ("viser",),
     "witness": ("ipctk",),
     "tetrahedralize": ("pytetwild",),
+    "benchmarks": ("cholespy",),
 }
 
 
