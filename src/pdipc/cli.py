@@ -98,6 +98,7 @@ EXTRAS = {
     "viewer": ("viser",),
     "witness": ("ipctk",),
     "tetrahedralize": ("pytetwild",),
+    "benchmarks": ("cholespy",),
 }
 
 

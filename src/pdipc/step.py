@@ -25,8 +25,8 @@ INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than thi
 STAGES = ("solver", "ccd", "barrier", "misc")
 STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places of the clock, in milliseconds
 RUNNING, CONVERGED, CAPPED, OUT_OF_TIME, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(6))
-STATUS, OUTER, TRUNCATIONS, BARRIERS = (wp.constant(place) for place in range(4))
-COUNTS = 4
+STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND = (wp.constant(place) for place in range(5))
+COUNTS = 5
 
 # The step is one graph, so its stages are timed where it runs.
 _CLOCK = """
@@ -161,6 +161,8 @@ def kernels(real: Real) -> SimpleNamespace:
         status = int(RUNNING)
         residual = largest[0]
         free_flight = pairs[0] == 0 and increment[0] <= tolerance
+        waits = count[BEHIND] > 0 and count[OUTER] % 2 == 1  # see commit
+        count[BEHIND] = 0
         if overflow[0] != 0:
             status = OVERFLOW
         elif residual >= scalar(wp.inf):
@@ -171,10 +173,10 @@ def kernels(real: Real) -> SimpleNamespace:
             count[BARRIERS] = pairs[0]
             if passes[0] > 0:
                 count[TRUNCATIONS] = count[TRUNCATIONS] + 1
-            settled = passes[0] == 0 and (residual <= tolerance or free_flight)
+            settled = passes[0] == 0 and not waits and (residual <= tolerance or free_flight)
             if as_printed != 0:
                 largest[0] = wp.sqrt(committed[0])
-                settled = largest[0] <= tolerance
+                settled = largest[0] <= tolerance and not waits
             if settled:
                 status = CONVERGED
             elif budget_ms > wp.float64(0.0) and clock[LAST] - clock[STARTED] > budget_ms:
@@ -196,11 +198,17 @@ def kernels(real: Real) -> SimpleNamespace:
         x_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
     ):
-        """The truncated motion is made. Scripted vertices go on to their target in the next outer iteration."""
+        """The truncated motion is made. Scripted vertices that it left behind their target go on to it in every second outer
+        iteration: in the one between, the others make way, so that gaps do not shrink from iteration to iteration.
+        """
         i = first + wp.tid()
         if count[STATUS] < OVERFLOW:
             x_out[i] = x_end[i]
-            x_tilde_out[i] = wp.where(free[i] > scalar(0.0), x_end[i], target[i])
+            x_tilde_out[i] = x_end[i]
+            if free[i] == scalar(0.0) and wp.length_sq(target[i] - x_end[i]) > scalar(0.0):
+                count[BEHIND] = 1
+                if count[OUTER] % 2 == 0:
+                    x_tilde_out[i] = target[i]
 
     @wp.kernel(module=module)
     def finish(

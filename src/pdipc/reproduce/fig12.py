@@ -12,7 +12,7 @@ from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.schema import Scene
 
 STEPS, SMALL_STEPS = 40, 12  # until the boards are closed
-FINAL, SMALL_FINAL = 0.2, 0.6  # of the distance of the boards that is then left
+FINAL, SMALL_FINAL = 0.3, 0.6  # of the distance of the boards that is then left
 IPC_STEPS = 20  # IPC goes no further, for its steps take longer and longer
 H = 0.01  # s
 DENSITY, YOUNG_MODULUS = 1000.0, 5e4  # kg/m^3, Pa; as rigid as possible: Poisson's ratio is 0

@@ -109,7 +109,7 @@ def _picture(x: np.ndarray, culling: PatchCulling, patch: np.ndarray, level: int
         mesh["color"] = colors[patch]
         plotter.add_mesh(mesh, scalars="color", rgb=True, ambient=0.25, specular=0.1)
     else:
-        plotter.add_mesh(mesh, color="#d9dce1", smooth_shading=True, ambient=0.3)
+        plotter.add_mesh(mesh, color="#b4b9c2", smooth_shading=True)
         low, high = boxes(culling, level)
         grid = [pyvista.Box(np.column_stack(corners).ravel()) for corners in zip(low, high, strict=True)]
         own = _colors(len(grid))
