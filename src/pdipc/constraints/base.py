@@ -46,11 +46,10 @@ def make_set(kind: str, vertices, gradient, weight, **data: np.ndarray) -> Const
 
 def stiffness_matrix(count: int, sets: list[ConstraintSet]) -> scipy.sparse.csr_matrix:
     """(count, count): sum of w G^T G, the constant part of Eq. (3) without the mass; the same for the three coordinates."""
-    rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for s in sets:
+    matrix = scipy.sparse.csr_matrix((count, count))
+    for s in sets:  # one kind at a time: triplets of all together would need more memory than anything else in a model
         corners = s.vertices.shape[1]
-        rows.append(np.repeat(s.vertices, corners, axis=1).ravel())
-        columns.append(np.tile(s.vertices, (1, corners)).ravel())
-        values.append(np.einsum("e,eri,erj->eij", s.weight, s.gradient, s.gradient).ravel())
-    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return scipy.sparse.csr_matrix(triplets, shape=(count, count))
+        rows, columns = np.repeat(s.vertices, corners, axis=1).ravel(), np.tile(s.vertices, (1, corners)).ravel()
+        values = np.einsum("e,eri,erj->eij", s.weight, s.gradient, s.gradient).ravel()
+        matrix = matrix + scipy.sparse.csr_matrix((values, (rows, columns)), shape=(count, count))
+    return matrix

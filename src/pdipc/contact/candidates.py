@@ -156,6 +156,7 @@ class CandidateList:
             return wp.zeros(size, dtype=dtype, device=self.device.warp)
 
         real, blocks = self.real, -(-capacity // self.device.block)
+        self.quads = self.limits = self.gaps = self.times = None  # the old ones are given back first
         self.count, self.capacity = count, capacity
         self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
         self.gaps, self.times = make(capacity, real.scalar), make(capacity, wp.int32)

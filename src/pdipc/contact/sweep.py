@@ -80,7 +80,7 @@ class PairList:
         self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
 
     def _room_for_slots(self, each: int) -> None:
-        self.room = each
+        self.room, self.slots = each, None  # the old ones are given back first
         self.slots = wp.zeros(max(1, self.primitives * each), dtype=wp.vec2i, device=self.device.warp)
 
     def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
@@ -102,5 +102,6 @@ class PairList:
         average = 2 * found // max(1, self.primitives)
         if average > self.room:
             self._room_for_slots(min(average, MOST_SLOTS))
+        self.pairs = None
         self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
         return True
