@@ -146,13 +146,14 @@ def test_published_frames(name, method):
     # the source numbers vertices, then edges by their later and then their earlier end, then faces
     edges = surface.unique_edges(faces)
     edges = edges[np.lexsort((edges[:, 0], edges[:, 1]))]
-    pairs = frame["pair_ee"][frame["hit_ee"]] - n
-    quads = np.sort(edges[pairs].reshape(-1, 2, 2), axis=2)
-    apart = np.array([len(set(q.ravel())) == 4 for q in quads], dtype=bool)
-    found = {frozenset((tuple(a), tuple(b))) for a, b in skin.members[1][edge_edge].tolist()}
-    assert all(frozenset(map(tuple, q)) in found for q in quads[apart].tolist())
-    pairs = frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]
-    found = {(v, frozenset(skin.members[2][t].tolist())) for v, t in vertex_triangle.tolist()}
-    expected = [(int(v), frozenset(faces[t].tolist())) for v, t in pairs.tolist() if v not in faces[t]]
-    assert len(expected) + apart.sum() > 50
-    assert all(pair in found for pair in expected)
+    own = {kind: {tuple(sorted(row)): k for k, row in enumerate(skin.members[kind].tolist())} for kind in (1, 2)}
+    hits = edges[frame["pair_ee"][frame["hit_ee"]] - n]  # (k, 2, 2)
+    hits = [pair for pair in hits.tolist() if len({*pair[0], *pair[1]}) == 4]
+    expected = np.sort([[own[1][tuple(sorted(edge))] for edge in pair] for pair in hits], axis=1)
+    assert np.isin(expected @ [len(edges), 1], np.sort(edge_edge, axis=1).astype(np.int64) @ [len(edges), 1]).all()
+    contacts = len(expected)
+    hits = frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]
+    hits = [(v, faces[t].tolist()) for v, t in hits.tolist() if v not in faces[t]]
+    expected = np.array([[v, own[2][tuple(sorted(face))]] for v, face in hits])
+    assert np.isin(expected @ [len(faces), 1], vertex_triangle.astype(np.int64) @ [len(faces), 1]).all()
+    assert contacts + len(expected) > 50
