@@ -39,7 +39,7 @@ from pdipc.precision import real  # noqa: E402
 
 GOAL = 1e-3
 LIMIT = 1.0
-DEFAULT = DEFAULT_SOLVER["barrier"]
+DEFAULT = DEFAULT_SOLVER["cpu"]["barrier"]
 DIRECT_BLOCK = 12_000  # vertices of the largest block of tetrahedra that is factorized
 OURS = {
     "pcg": {},

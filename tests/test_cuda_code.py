@@ -3,7 +3,7 @@
 import pytest
 import warp as wp
 
-from pdipc import anderson, energy_rate, parallel
+from pdipc import anderson, energy_rate, forces, parallel
 from pdipc.constraints import projector
 from pdipc.contact import bvh, candidates, pairs, paper, patches, queries, restitution, sweep, truncation
 from pdipc.precision import real
@@ -11,6 +11,7 @@ from pdipc.step import kernels as step_kernels
 
 FACTORIES = {
     "step": step_kernels,
+    "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),
     "anderson": anderson.kernels,
     "energy_rate": energy_rate.kernels,

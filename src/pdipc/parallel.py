@@ -117,6 +117,11 @@ class Device:
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
         self._meeting = None if self.is_cuda else wp.zeros(32, dtype=wp.int32, device=self.warp)
 
+    @functools.cached_property
+    def records_loops(self) -> bool:
+        """Whether a recorded graph may hold loops and conditions: on CUDA from toolkit and driver 12.4 on."""
+        return not self.is_cuda or wp.is_conditional_graph_supported()
+
     def __deepcopy__(self, memo: dict) -> "Device":
         return self
 

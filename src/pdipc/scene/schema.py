@@ -72,7 +72,10 @@ class Simulation(Table):
     inner_iterations: int = Field(default=30, ge=1, description="Most local-global iterations in an outer iteration.")
     linear_solver: Literal[
         "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
-    ] = Field(default="auto", description='Solver of the global step; "auto": two-level, with the paper\'s contact a-jacobi.')
+    ] = Field(
+        default="auto",
+        description='Solver of the global step; "auto": two-level (on CUDA pcg), with the paper\'s contact a-jacobi.',
+    )
     linear_iterations: int = Field(default=20, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
