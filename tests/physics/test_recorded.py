@@ -89,3 +89,20 @@ def test_a_driver_without_loops_in_graphs(monkeypatch):
         positions, found = run("float64")
     assert np.array_equal(positions, expected)
     assert found == counts
+
+
+def test_recording_allocates_nothing(monkeypatch):
+    """CUDA refuses memory inside the loops of a graph."""
+    simulation = pdipc.Simulation(falling_cloth("float64"), "cpu")
+    device, allocated, recorded = wp.get_device("cpu"), [], []
+    allocate, capture = device.default_allocator.allocate, pdipc.parallel.Device.capture
+
+    def counted(self, launches, keep_alive=None):
+        with monkeypatch.context() as patch:
+            patch.setattr(device.default_allocator, "allocate", lambda size: allocated.append(size) or allocate(size))
+            recorded.append(launches.__name__)
+            return capture(self, launches, keep_alive)
+
+    monkeypatch.setattr(pdipc.parallel.Device, "capture", counted)
+    simulation.step()
+    assert (allocated, recorded[0]) == ([], "whole_step")
