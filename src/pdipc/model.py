@@ -193,7 +193,13 @@ def build(scene: Scene, device: str | None = None) -> Model:
             f'simulation.linear_solver is "{name}", which cannot take the contacts of contact.method '
             f'"{method}"; it must be one of: {", ".join(other for other in SOLVERS if other not in UNFIT[method])}'
         )
+    if sim.solver_drop > 0.0 and name != "a-jacobi":
+        raise SceneError(
+            f'simulation.solver_drop is {sim.solver_drop:g}, but only a-jacobi has A-products; the solver is "{name}"'
+        )
     options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
+    if name == "a-jacobi":
+        options["drop"] = sim.solver_drop
     system = System(place, number, matrix, free)
     solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
 

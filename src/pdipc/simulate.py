@@ -142,6 +142,7 @@ def run_scene(
     else:
         topology = {"triangles": model.triangles, **model.assembly.topology()}
         meta = {"device": model.device.name, "precision": model.real.name, "threads": model.device.threads}
+        meta |= {"solver_dropped": model.solver.dropped}
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
         writer.append(0, 0.0, simulation.positions, {})
         writer.checkpoint(0, simulation.state.arrays())

@@ -9,8 +9,10 @@ from linear.contacts import CoupledContact
 from linear.test_solvers import MESHES, case, error, solve
 from pdipc.linear import System, make_solver
 from pdipc.linear.aggregated import aggregate
+from pdipc.model import build
 from pdipc.parallel import Device
 from pdipc.precision import real
+from pdipc.scene.errors import SceneError
 
 DEVICE, PRECISION = Device("cpu", threads=1), real("float64")
 
@@ -166,3 +168,18 @@ def test_refusals():
         make_solver("matrix-powers", system, order=0)
     with pytest.raises(ValueError, match="diverge"):
         make_solver("chebyshev", case("jittered Delaunay", "none", 0.0, DEVICE, PRECISION)[0], weight=1.0)
+
+
+def test_drop_in_a_scene():
+    """The option reaches the solver, what it left out is reported, and other solvers refuse it."""
+    from physics.scenes import cloth, scene
+
+    def built(**simulation):
+        return build(scene([cloth("sheet", [0.4, 0.4], [7, 7])], contact={"method": "paper"}, **simulation), "cpu").solver
+
+    whole, thinned = built(), built(solver_drop=1e-2)
+    assert whole.dropped == 0.0
+    assert 0.0 < thinned.dropped < 0.2
+    assert thinned.products.paths < whole.products.paths
+    with pytest.raises(SceneError, match=r'only a-jacobi has A-products; the solver is "pcg"'):
+        built(solver_drop=1e-2, linear_solver="pcg")
