@@ -139,7 +139,7 @@ def check_steps(report: Report, place: Device, names: tuple[str, ...], steps: in
             size = model.assembly.scene_size
             label = f"{name}, {precision}, {steps} steps:"
             report.check(f"{label} CUDA against CPU / size", np.abs(paths["here"] - paths["cpu"]).max() / size, STEP_TOLERANCE)
-            found = pdipc.find_intersections(paths["here"], model.triangles, model.assembly.scripted)
+            found = pdipc.find_intersections(paths["here"], model.triangles, model.assembly.obstacle)
             report.check(f"{label} intersections", len(found), 0)
             report.check(f"{label} bits that differ the second time", np.count_nonzero(paths["here"] != paths["again"]), 0)
             report.check(f"{label} bits that differ unrecorded", np.count_nonzero(paths["here"] != paths["launched"]), 0)
@@ -240,7 +240,7 @@ def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, ste
         times.append(1e3 * (time.perf_counter() - start))
     if not results:
         return {"scene": name, "skipped": "no time left"}
-    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.scripted)
+    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)
     report.check(f"{name}: intersections after {len(results)} steps", len(found), 0)
     stages = {key: statistics.fmean(r.milliseconds[key] for r in results) for key in results[0].milliseconds}
     row = {

@@ -332,7 +332,7 @@ def check(folder: RunArgument) -> None:
     opened = open_run(folder)
     bad = 0
     for frame in range(opened.frame_count):
-        pairs = find_intersections(opened.positions(frame), opened.triangles, opened.scripted)
+        pairs = find_intersections(opened.positions(frame), opened.triangles, opened.obstacle)
         if len(pairs):
             bad += 1
             typer.echo(f"frame {frame}, t = {opened.times[frame]:g} s: {len(pairs)} pairs of triangles intersect")

@@ -45,7 +45,7 @@ def test_coming_very_close_is_no_hit_and_is_measured(tmp_path):
 
 def test_obstacles_may_meet_each_other(tmp_path):
     run = cloth_moved(tmp_path / "run", 0.02)
-    run.scripted[:] = True
+    run.obstacle[:] = True
     certificate = certify(run)
     assert (certificate.pairs, certificate.hits) == (0, [])
 

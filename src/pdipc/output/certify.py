@@ -42,7 +42,7 @@ class Certificate:
 
 
 def certify(run: Run) -> Certificate:
-    """Replays the recorded motions of `run`. Pairs of which every vertex follows a script are left out.
+    """Replays the recorded motions of `run`. Pairs of two obstacles are left out.
 
     Raises RunError where the record does not lead without a break from the first frame through every other to the last.
     """
@@ -53,9 +53,9 @@ def certify(run: Run) -> Certificate:
     used, triangles = np.unique(run.triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3).astype(np.int32)
     edges = ipctk.edges(triangles)
-    scripted = run.scripted[used]
+    obstacle = run.obstacle[used]
     mesh = ipctk.CollisionMesh(run.positions(0)[used], edges, triangles)
-    mesh.can_collide = ipctk.make_vertex_patches_filter(np.where(scripted, 0, 1 + np.arange(len(used))).astype(np.int32))
+    mesh.can_collide = ipctk.make_vertex_patches_filter(np.where(obstacle, 0, 1 + np.arange(len(used))).astype(np.int32))
     moving = run.positions(0)[~run.scripted] if not run.scripted.all() else run.positions(0)
     size = float(np.linalg.norm(np.ptp(moving, axis=0)))
     near = NEAR * size
