@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from physics.scenes import cloth, floor, scene, watched
 
 import pdipc
+from physics.scenes import cloth, floor, scene, watched
 
 
 def test_closing_boards_arrive():
