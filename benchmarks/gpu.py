@@ -168,7 +168,7 @@ def check_scene(report: Report, place: Device, name: str, precision: str, steps:
     there = _positions(scene, "cpu", steps, recorded=True)
     here = _positions(scene, place.name, steps, recorded=True)
     report.check(f"{label} CUDA against CPU / size", np.abs(here - there).max() / model.assembly.scene_size, STEP_TOLERANCE)
-    found = pdipc.find_intersections(here, model.triangles, model.assembly.scripted)
+    found = pdipc.find_intersections(here, model.triangles, model.assembly.obstacle)
     report.check(f"{label} intersections", len(found), 0)
     for recorded, told in ((True, "the second time"), (False, "unrecorded")):
         again = _positions(scene, place.name, steps, recorded)
@@ -268,7 +268,7 @@ def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, ste
     if not results:
         report.add(scene=name, skipped="no time left")
         return
-    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.scripted)
+    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)
     report.check(f"{name}: intersections after {len(results)} steps", len(found), 0)
     stages = {key: statistics.fmean(r.milliseconds[key] for r in results) for key in results[0].milliseconds}
     row = {

@@ -224,7 +224,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
     def upload(values: np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
 
-    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, ~free)
+    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle)
     return Model(
         scene=scene,
         assembly=assembly,

@@ -146,14 +146,33 @@ def test_published_frames(name, method):
     # the source numbers vertices, then edges by their later and then their earlier end, then faces
     edges = surface.unique_edges(faces)
     edges = edges[np.lexsort((edges[:, 0], edges[:, 1]))]
-    own = {kind: {tuple(sorted(row)): k for k, row in enumerate(skin.members[kind].tolist())} for kind in (1, 2)}
-    hits = edges[frame["pair_ee"][frame["hit_ee"]] - n]  # (k, 2, 2)
-    hits = [pair for pair in hits.tolist() if len({*pair[0], *pair[1]}) == 4]
-    expected = np.sort([[own[1][tuple(sorted(edge))] for edge in pair] for pair in hits], axis=1)
-    assert np.isin(expected @ [len(edges), 1], np.sort(edge_edge, axis=1).astype(np.int64) @ [len(edges), 1]).all()
-    contacts = len(expected)
-    hits = frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]
-    hits = [(v, faces[t].tolist()) for v, t in hits.tolist() if v not in faces[t]]
-    expected = np.array([[v, own[2][tuple(sorted(face))]] for v, face in hits])
-    assert np.isin(expected @ [len(faces), 1], vertex_triangle.astype(np.int64) @ [len(faces), 1]).all()
-    assert contacts + len(expected) > 50
+    vertices, own_edges, own_faces = skin.members
+    i, j = (places(edges[own - n], own_edges) for own in frame["pair_ee"][frame["hit_ee"]].T)
+    apart = (own_edges[i][:, :, None] != own_edges[j][:, None, :]).all(axis=(1, 2))
+    all_listed(np.minimum(i, j)[apart], np.maximum(i, j)[apart], *edge_edge.T)
+    v, t = (frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]).T
+    apart_too = (faces[t] != v[:, None]).all(axis=1)
+    v, t = places(v[apart_too, None], vertices), places(faces[t[apart_too]], own_faces)
+    position = np.zeros(n, dtype=int)
+    position[vertices[:, 0]] = np.arange(len(vertices))
+    all_listed(v, t, position[vertex_triangle[:, 0]], vertex_triangle[:, 1])
+    assert len(v) + apart.sum() > 50
+
+
+def places(rows, table):
+    """(k,) where each row of vertices is in a table that holds it."""
+
+    def keys(a):
+        return np.ravel_multi_index(tuple(a.T.astype(np.int64)), (table.max() + 1,) * table.shape[1])
+
+    order = np.argsort(keys(table))
+    found = order[np.searchsorted(keys(table)[order], keys(rows))]
+    assert np.array_equal(table[found], rows)
+    return found
+
+
+def all_listed(first, second, listed_first, listed_second):
+    """Every pair is in the list, which ascends by its first, then its second."""
+    wanted, listed = (a.astype(np.int64) << 31 | b for a, b in ((first, second), (listed_first, listed_second)))
+    assert np.all(np.diff(listed) > 0)
+    assert np.array_equal(listed[np.minimum(np.searchsorted(listed, wanted), len(listed) - 1)], wanted)
