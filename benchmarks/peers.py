@@ -263,7 +263,13 @@ def main() -> None:
     settings = {"iterations": options.iterations, "substeps": options.substeps, "gap": options.gap}
     settings |= {"contact_stiffness": CONTACT_STIFFNESS, "buffers": [VERTEX_BUFFER, EDGE_BUFFER]}
     rows = []
-    report = {"machine": machine(), "device": options.device, "load_average": os.getloadavg()[0], "newton": settings, "rows": rows}
+    report = {
+        "machine": machine(),
+        "device": options.device,
+        "load_average": os.getloadavg()[0],
+        "newton": settings,
+        "rows": rows,
+    }
     out = Path(__file__).parent / "results" / "peers.json"
     out.parent.mkdir(exist_ok=True)
     print(

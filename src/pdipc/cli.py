@@ -570,17 +570,18 @@ def scenes(plain: Annotated[bool, typer.Option("--plain", help="Names only, one 
 @command()
 def view(
     what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run folder to play, or a scene to simulate live.")],
-    port: Annotated[int, typer.Option(help="Port of the page.")] = 8080,
+    host: Annotated[str, typer.Option(help='Who may watch: "localhost", or "0.0.0.0" for other machines too.')] = "localhost",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page; if it is taken, the next free one.")] = 8080,
     device: Annotated[str | None, typer.Option(help='"cpu" or "cuda:0".')] = None,
 ) -> None:
-    """Watch a run, or a scene while it is simulated, in the browser."""
+    """Watch a run, or a scene while it is simulated, in the browser; there, bodies can be dragged with the mouse."""
     from pdipc import viewer
     from pdipc.output.results import open_run
 
     if Path(what).is_dir():
-        viewer.play(open_run(what), port=port)
+        viewer.play(open_run(what), host, port)
     else:
-        viewer.simulate(load(what), port=port, device=device)
+        viewer.simulate(load(what), host, port, device)
 
 
 @command()

@@ -298,7 +298,7 @@ class Work:
         self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
         self._graphs: dict[str, Graph] = {}
         self._graphs_of: tuple[int, int] = (-1, -1)
-        self._scripted = False
+        self._scripted = self._steady = False  # whether `target` is uploaded, and `acceleration` holds what stays
 
     def set_scripted(self, state: State, time: float) -> None:
         """Where kinematic vertices go by `time`, and the external accelerations; only uploaded where they change."""
@@ -306,10 +306,11 @@ class Work:
         if not self._scripted or model.moves:
             self.target.assign(model.kinematic_targets(time))
             model.move_anchors(time)
-        if not self._scripted or not model.external.constant:
+        self._scripted = True
+        if not (self._steady and model.external.constant):
             positions, velocities = state.positions.numpy(), state.velocities.numpy()
             self.acceleration.assign(model.external.accelerations(state.time, positions, velocities))
-        self._scripted = True
+            self._steady = model.external.constant
 
     def run(self, part: Callable[[], None]) -> None:
         """Replays `part` of a step; records it first where it is new or arrays were replaced."""
