@@ -416,6 +416,7 @@ class Work:
 
     def _rebound(self) -> None:
         model, rebound = self.model, self.restitution
+        assert rebound is not None  # `finish` asks
         model.projector.add_forces(self.x, rebound.elastic, rebound.zero)
         self.parting.begin(REBOUND_ITERATIONS)
 

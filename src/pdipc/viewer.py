@@ -5,12 +5,16 @@ its message, as it does anywhere else, and no state is shared between threads bu
 """
 
 import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.linalg import cg
+
+from pdipc.simulate import Simulation, stats_of
 
 PALETTE = ((228, 120, 60), (70, 120, 190), (110, 170, 90), (200, 90, 120), (150, 120, 190), (220, 180, 70))
 GREY = (185, 185, 190)
@@ -21,9 +25,9 @@ IDLE = 0.02  # s between two looks at what the browser did
 # What is dragged is on a damped spring, in units of its own compliance, so that it follows alike in cloth and in heavy blocks. The
 # spring is explicit in time: PULL and DRAG are far below what is stable for the compliance that is computed, because a body that
 # turns or folds gives way more easily than the constant matrix says.
-PULL, DRAG = 0.05, 0.2
+PULL, DRAG = 0.1, 0.3
 REACH = 0.1  # of the scene size: further away, the pull grows no more
-GRIP = 0.15  # of the body's size: the radius of what is held, for a single vertex would be torn into a spike
+GRIP, HELD = 0.2, 8  # radius of what is held, of the body's size, and least number of vertices: one alone would be torn out
 
 
 class View:
@@ -124,7 +128,7 @@ class Grip:
     compliance: float
 
     @staticmethod
-    def at(simulation: Any, body: int, point: np.ndarray) -> "Grip | None":
+    def at(simulation: Simulation, body: int, point: np.ndarray) -> "Grip | None":
         """The grip on `body` nearest to `point` (3,), m; None if no vertex of it is free."""
         model, x = simulation.model, simulation.positions
         own = model.assembly.bodies[body]
@@ -132,9 +136,11 @@ class Grip:
         choice = free[(free >= own.first) & (free < own.last)]
         if len(choice) == 0:
             return None
-        vertex = choice[np.argmin(np.linalg.norm(x[choice] - point, axis=1))]
-        radius = GRIP * np.linalg.norm(np.ptp(x[own.first : own.last], axis=0))
-        vertices = choice[np.linalg.norm(x[choice] - x[vertex], axis=1) <= radius]
+        away = np.linalg.norm(x[choice] - point, axis=1)
+        vertex = choice[np.argmin(away)]
+        away = np.linalg.norm(x[choice] - x[vertex], axis=1)
+        radius = max(GRIP * np.linalg.norm(np.ptp(x[own.first : own.last], axis=0)), np.sort(away)[:HELD][-1])
+        vertices = choice[away <= radius]
         mass = model.mass.numpy()[vertices].astype(np.float64)
         shares = np.zeros(model.vertex_count)
         shares[vertices] = mass / mass.sum()
@@ -143,7 +149,7 @@ class Grip:
         given_way, _ = cg(matrix, shares[free], rtol=1e-2, maxiter=200, M=preconditioner)  # a few per cent do no harm
         return Grip(int(vertex), vertices, shares[vertices], float(given_way @ shares[free]) * model.substeps**2)
 
-    def forces(self, simulation: Any, point: np.ndarray) -> np.ndarray:
+    def forces(self, simulation: Simulation, point: np.ndarray) -> np.ndarray:
         """(k, 3) N that pull the vertex towards `point` (3,), m, within the next step."""
         model, state = simulation.model, simulation.state
         way = point - state.positions.numpy()[self.vertex]
@@ -160,8 +166,6 @@ class Live:
     """
 
     def __init__(self, scene: Any, host: str = HOST, port: int = PORT, device: str | None = None):
-        from pdipc.simulate import Simulation
-
         self.simulation = Simulation(scene, device)
         self.assembly = assembly = self.simulation.model.assembly
         kinds = [body.kind for body in assembly.bodies]
@@ -172,19 +176,17 @@ class Live:
         self.report = gui.add_markdown(_told(0.0, {}))
         one_step, reset = gui.add_button("one step"), gui.add_button("reset")
         gui.add_markdown("Drag a body to pull at it, the background to turn the view.")
-        self.line = self.view.server.scene.add_line_segments(
-            "/pull", np.zeros((1, 2, 3), dtype=np.float32), (30, 30, 30), line_width=3.0, visible=False
-        )
-        self.asked = {"step": False, "reset": False}
-        one_step.on_click(lambda _: self.asked.update(step=True))
-        reset.on_click(lambda _: self.asked.update(reset=True))
+        self.todo: deque[Callable[[], None]] = deque()  # what the browser asked for since the last look
+        one_step.on_click(lambda _: self.todo.append(self.step))
+        reset.on_click(lambda _: self.todo.append(self.reset))
         self.held: Grip | None = None
         self.point = np.zeros(3)  # where the mouse is, m
         for body, mesh in enumerate(self.view.meshes):
             if kinds[body] != "obstacle":
-                mesh.on_drag("left")(
-                    lambda event, body=body: self.drag(body, event.phase, event.start_position, event.end_position)
-                )
+                mesh.on_drag("left")(lambda event, body=body: self.todo.append(self._dragging(body, event)))
+
+    def _dragging(self, body: int, event: Any) -> Callable[[], None]:
+        return lambda: self.drag(body, event.phase, event.start_position, event.end_position)
 
     def drag(self, body: int, phase: str, start: Any, end: Any) -> None:
         """Takes hold of the free vertex of `body` nearest to the point `start`, m, and of those around it, on phase "start"; leads
@@ -196,30 +198,31 @@ class Live:
         elif phase == "end":
             self.held = None
 
-    def advance(self) -> None:
-        """Acts on what was asked for, and takes a step where it runs."""
-        asked, self.asked = self.asked, {"step": False, "reset": False}
-        if asked["reset"]:
-            self.held = None
-            self.simulation.reset()
-            self._show({})
-        if self.running.value or asked["step"]:
-            from pdipc.simulate import stats_of
+    def step(self) -> None:
+        """One step, with the pull of the mouse."""
+        held = self.held
+        if held is None:
+            self.simulation.set_vertex_force(np.zeros(0), np.zeros((0, 3)))
+        else:
+            self.simulation.set_vertex_force(held.vertices, held.forces(self.simulation, self.point))
+        self._show(stats_of(self.simulation.step()))
 
-            held = self.held
-            if held is None:
-                self.simulation.set_vertex_force(np.zeros(0), np.zeros((0, 3)))
-            else:
-                self.simulation.set_vertex_force(held.vertices, held.forces(self.simulation, self.point))
-            self._show(stats_of(self.simulation.step()))
+    def reset(self) -> None:
+        """Back to the start, with nothing held."""
+        self.held = None
+        self.simulation.reset()
+        self._show({})
+
+    def advance(self) -> None:
+        """Does what was asked for, and takes a step where it runs."""
+        while self.todo:
+            self.todo.popleft()()
+        if self.running.value:
+            self.step()
 
     def _show(self, record: dict[str, Any]) -> None:
-        positions, held = self.simulation.positions, self.held
-        self.view.show(positions)
+        self.view.show(self.simulation.positions)
         self.report.content = _told(self.simulation.state.time, record)
-        self.line.visible = held is not None
-        if held is not None:
-            self.line.points = np.array([[positions[held.vertex], self.point]], dtype=np.float32)
 
     def loop(self) -> None:
         """Simulates until an exception such as KeyboardInterrupt."""
