@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import io
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,7 +107,7 @@ def read(name: str | Path) -> Mesh:
             vertices, tets, triangles = _read_trimesh(path)
     except SceneError:
         raise
-    except (Exception, SystemExit) as error:  # meshio ends the process on some malformed files
+    except Exception as error:
         raise SceneError(f'mesh file "{path}": cannot be read as {suffix}: {error}') from error
     return from_arrays(vertices, tets, triangles, f'mesh file "{path}"')
 
@@ -154,8 +155,17 @@ def _read_npz(path: Path):
 def _read_meshio(path: Path):
     import meshio
 
-    mesh = meshio.read(path)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            mesh = meshio.read(path)
+    except SystemExit as error:  # meshio prints what is wrong and ends the process on some files
+        raise ValueError(" ".join(said.getvalue().split())) from error
     cells = mesh.cells_dict
+    if not {"tetra", "triangle"} & set(cells):
+        raise SceneError(
+            f'mesh file "{path}": holds cells of the kinds {", ".join(cells) or "none"}; needed: tetra (of four vertices) or triangle'
+        )
     return _three(mesh.points), cells.get("tetra"), cells.get("triangle")
 
 
