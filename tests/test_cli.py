@@ -132,6 +132,8 @@ def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path):
     fake.interrupt_after = None
     assert runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume"]).exit_code == 0
     assert fake.given["device"] == "cpu"
+    again = runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume", "--steps", "5"])
+    assert (again.exit_code, "has 8 steps already; nothing was added" in again.stdout) == (0, True)
     for i in range(9):
         np.testing.assert_array_equal(open_run(cut).positions(i), open_run(whole).positions(i))
 
@@ -159,6 +161,13 @@ def test_check_finds_what_intersects(folder):
     assert 'of "ball" and triangle' in result.stdout
     assert '"cloth"' in result.stdout
     assert "1 of 4 frames intersect" in result.stderr
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = [sys.executable, "-m", "pdipc", "scenes", "--plain"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
 
 
 def test_certify_prints_the_verdict(folder):

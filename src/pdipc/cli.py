@@ -164,8 +164,10 @@ def run(
         if value is not None:
             _override(loaded, name, value)
     folder = out or Path("runs") / Path(scene).stem
+    begun = 0
     if resume:
         earlier = open_run(folder)
+        begun = earlier.frame_count - 1
         _same_scene(earlier, loaded, folder)
         device = _same_device(earlier, device, folder)
 
@@ -203,6 +205,8 @@ def run(
             err=True,
         )
         raise typer.Exit(INTERRUPTED) from None
+    if resume and begun >= total:
+        typer.echo(f"{folder} has {begun} steps already; nothing was added to it")
     _summary(folder, time.monotonic() - began)
     if audited:
         audit(folder)

@@ -93,6 +93,8 @@ def test_a_surface_is_filled_with_tets():
     volumes = meshes.tet_volumes(solid.vertices, solid.tets)
     assert volumes.min() > 0
     assert volumes.sum() == pytest.approx(1.0, rel=2e-2)
+    with pytest.raises(SceneError, match=r"here: .* no inside to fill; the surface must be closed, and 4 of its edges"):
+        meshes.tetrahedralize(generators.Plane().mesh(), "here")
 
 
 @pytest.mark.parametrize(

@@ -230,4 +230,11 @@ def tetrahedralize(mesh: Mesh, where: str) -> Mesh:
         ) from error
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it works
         vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]  # pyright: ignore
+    if len(tets) == 0:
+        sides = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        rim = int(np.count_nonzero(np.unique(sides, axis=0, return_counts=True)[1] == 1))
+        raise SceneError(
+            f'{where}: "tetrahedralize" found no inside to fill; the surface must be closed, and {rim} of its edges belong to one '
+            "triangle only"
+        )
     return from_arrays(vertices, tets, None, f"{where}, tetrahedralized")
