@@ -1,5 +1,6 @@
 """The command line: exit codes, messages on the right stream, and what its commands write."""
 
+import contextlib
 import json
 import os
 import signal
@@ -136,6 +137,33 @@ def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path):
     assert (again.exit_code, "has 8 steps already; nothing was added" in again.stdout) == (0, True)
     for i in range(9):
         np.testing.assert_array_equal(open_run(cut).positions(i), open_run(whole).positions(i))
+
+
+@pytest.mark.parametrize("turned_into", [KeyboardInterrupt, TypeError])
+def test_an_interrupt_before_the_first_step_says_so(scene, tmp_path, monkeypatch, turned_into):
+    def run_scene(*args, **options):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise turned_into("in the middle of an import") from None
+
+    monkeypatch.setitem(sys.modules, "pdipc.simulate", types.SimpleNamespace(run_scene=run_scene))
+    result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 130
+    assert "interrupted before a step was taken" in result.stderr
+
+
+def test_an_interrupt_that_a_library_loses_ends_the_run_after_a_step(fake, scene, tmp_path, monkeypatch):
+    steps = sys.modules["pdipc.simulate"].run_scene
+
+    def run_scene(*args, **options):
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        steps(*args, **options)
+
+    monkeypatch.setattr(sys.modules["pdipc.simulate"], "run_scene", run_scene)
+    result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
+    assert (result.exit_code, "stopped after step 1 of 8" in result.stderr) == (130, True)
 
 
 def test_resuming_with_another_scene_or_device_is_refused(fake, scene, tmp_path):

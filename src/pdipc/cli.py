@@ -175,6 +175,13 @@ def run(
 
     total = loaded.simulation.steps if steps is None else steps
     began = time.monotonic()
+    done = None
+
+    def advanced(info) -> None:
+        nonlocal done
+        done = info.step
+        advance(info)
+
     try:
         with _progress(total) as advance:
             run_scene(
@@ -185,9 +192,12 @@ def run(
                 resume=resume,
                 overwrite=overwrite,
                 certify=certify,
-                progress=advance,
+                progress=advanced,
             )
     except KeyboardInterrupt:
+        if done is None:
+            typer.echo("pdipc: interrupted before a step was taken", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         options = "".join(
             f" {name} {value}"
             for name, value in (
@@ -198,7 +208,6 @@ def run(
             )
             if value is not None
         )
-        done = open_run(folder).frame_count - 1
         typer.echo(
             f"pdipc: stopped after step {done} of {total}, everything is saved in {folder}; go on with:\n"
             f"  pdipc run {scene} -o {folder}{options}{' --certify' if certify else ''} --resume",
@@ -274,9 +283,9 @@ def _progress(total: int):
 
     def interrupt(signum, frame) -> None:
         nonlocal interrupted
-        if interrupted or not stepping:
+        at_once, interrupted = interrupted or not stepping, True
+        if at_once:
             raise KeyboardInterrupt
-        interrupted = True
 
     bar = Progress(
         TextColumn("step"),
@@ -303,6 +312,10 @@ def _progress(total: int):
                     raise KeyboardInterrupt
 
             yield advance
+    except Exception:
+        if interrupted:  # some libraries turn an interrupt into an error of their own, or lose it: `advance` raises it then
+            raise KeyboardInterrupt from None
+        raise
     finally:
         signal.signal(signal.SIGINT, previous)
 
