@@ -119,7 +119,10 @@ def from_arrays(
 
     A whole mesh of negative tets is an orientation convention and is turned; mixed signs are left for the check to report.
     """
-    vertices = np.array(vertices, dtype=np.float64)
+    try:
+        vertices = np.array(vertices, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{where}: vertices must be numbers: {error}") from error
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
         raise SceneError(f"{where}: vertices have the shape {vertices.shape}; they must be (n, 3) with n > 0")
     kind, elements, width = ("tets", tets, 4) if tets is not None and len(tets) else ("triangles", triangles, 3)
@@ -128,7 +131,7 @@ def from_arrays(
         raise SceneError(f"{where}: holds neither triangles nor tetrahedra")
     if elements.ndim != 2 or elements.shape[1] != width:
         raise SceneError(f"{where}: {kind} have the shape {elements.shape}; they must be (m, {width})")
-    if not np.all(elements == np.floor(elements)):
+    if elements.dtype.kind not in "iuf" or not np.all(elements == np.floor(elements)):
         raise SceneError(f"{where}: {kind} must be whole numbers")
     elements = elements.astype(np.int64)
     if elements.min() < 0 or elements.max() >= len(vertices):
@@ -178,21 +181,25 @@ def _read_trimesh(path: Path):
 
     # merge_norm and merge_tex: a mesh cut along seams of its normals or textures is one surface here
     mesh = trimesh.load(path, force="mesh", process=False)
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    if len(mesh.faces) == 0:
+        raise SceneError(f'mesh file "{path}": holds no triangles')
+    if np.isfinite(mesh.vertices).all() and mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices):
+        mesh.merge_vertices(merge_norm=True, merge_tex=True)
     return mesh.vertices, None, mesh.faces
 
 
 def _read_tetgen(path: Path):
-    def rows(file: Path) -> tuple[np.ndarray, int]:
+    def rows(file: Path) -> np.ndarray:
         if not file.is_file():
             raise SceneError(f'mesh file "{path}": needs "{file.name}" beside it')
         lines = [line.split("#")[0].split() for line in file.read_text().splitlines()]
         lines = [line for line in lines if line]
         count = int(lines[0][0])
-        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]]), count
+        if len(lines) <= count:
+            raise SceneError(f'mesh file "{file}": its first line says {count} rows, and {len(lines) - 1} are there')
+        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]])
 
-    nodes, _ = rows(path.with_suffix(".node"))
-    elements, _ = rows(path.with_suffix(".ele"))
+    nodes, elements = rows(path.with_suffix(".node")), rows(path.with_suffix(".ele"))
     return nodes[:, 1:4], elements[:, 1:5] - nodes[0, 0], None
 
 
