@@ -1,5 +1,6 @@
 """The command line: exit codes, messages on the right stream, and what its commands write."""
 
+import contextlib
 import json
 import os
 import signal
@@ -132,8 +133,37 @@ def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path):
     fake.interrupt_after = None
     assert runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume"]).exit_code == 0
     assert fake.given["device"] == "cpu"
+    again = runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume", "--steps", "5"])
+    assert (again.exit_code, "has 8 steps already; nothing was added" in again.stdout) == (0, True)
     for i in range(9):
         np.testing.assert_array_equal(open_run(cut).positions(i), open_run(whole).positions(i))
+
+
+@pytest.mark.parametrize("turned_into", [KeyboardInterrupt, TypeError])
+def test_an_interrupt_before_the_first_step_says_so(scene, tmp_path, monkeypatch, turned_into):
+    def run_scene(*args, **options):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise turned_into("in the middle of an import") from None
+
+    monkeypatch.setitem(sys.modules, "pdipc.simulate", types.SimpleNamespace(run_scene=run_scene))
+    result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 130
+    assert "interrupted before a step was taken" in result.stderr
+
+
+def test_an_interrupt_that_a_library_loses_ends_the_run_after_a_step(fake, scene, tmp_path, monkeypatch):
+    steps = sys.modules["pdipc.simulate"].run_scene
+
+    def run_scene(*args, **options):
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        steps(*args, **options)
+
+    monkeypatch.setattr(sys.modules["pdipc.simulate"], "run_scene", run_scene)
+    result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
+    assert (result.exit_code, "stopped after step 1 of 8" in result.stderr) == (130, True)
 
 
 def test_resuming_with_another_scene_or_device_is_refused(fake, scene, tmp_path):
@@ -159,6 +189,13 @@ def test_check_finds_what_intersects(folder):
     assert 'of "ball" and triangle' in result.stdout
     assert '"cloth"' in result.stdout
     assert "1 of 4 frames intersect" in result.stderr
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = [sys.executable, "-m", "pdipc", "scenes", "--plain"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
 
 
 def test_certify_prints_the_verdict(folder):

@@ -77,6 +77,11 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
 
             try:
                 function(*given, **options)
+            except (
+                BrokenPipeError
+            ):  # the reader, such as `head`, has seen enough; nothing more can be printed, not even at exit
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise typer.Exit(1) from None
             except (RunError, OSError, ValueError, IndexError) as error:  # SceneError is a ValueError
                 if "PDIPC_TRACEBACK" in os.environ:
                     raise
@@ -159,8 +164,10 @@ def run(
         if value is not None:
             _override(loaded, name, value)
     folder = out or Path("runs") / Path(scene).stem
+    begun = 0
     if resume:
         earlier = open_run(folder)
+        begun = earlier.frame_count - 1
         _same_scene(earlier, loaded, folder)
         device = _same_device(earlier, device, folder)
 
@@ -168,6 +175,13 @@ def run(
 
     total = loaded.simulation.steps if steps is None else steps
     began = time.monotonic()
+    done = None
+
+    def advanced(info) -> None:
+        nonlocal done
+        done = info.step
+        advance(info)
+
     try:
         with _progress(total) as advance:
             run_scene(
@@ -178,9 +192,12 @@ def run(
                 resume=resume,
                 overwrite=overwrite,
                 certify=certify,
-                progress=advance,
+                progress=advanced,
             )
     except KeyboardInterrupt:
+        if done is None:
+            typer.echo("pdipc: interrupted before a step was taken", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         options = "".join(
             f" {name} {value}"
             for name, value in (
@@ -191,13 +208,14 @@ def run(
             )
             if value is not None
         )
-        done = open_run(folder).frame_count - 1
         typer.echo(
             f"pdipc: stopped after step {done} of {total}, everything is saved in {folder}; go on with:\n"
             f"  pdipc run {scene} -o {folder}{options}{' --certify' if certify else ''} --resume",
             err=True,
         )
         raise typer.Exit(INTERRUPTED) from None
+    if resume and begun >= total:
+        typer.echo(f"{folder} has {begun} steps already; nothing was added to it")
     _summary(folder, time.monotonic() - began)
     if audited:
         audit(folder)
@@ -265,9 +283,9 @@ def _progress(total: int):
 
     def interrupt(signum, frame) -> None:
         nonlocal interrupted
-        if interrupted or not stepping:
+        at_once, interrupted = interrupted or not stepping, True
+        if at_once:
             raise KeyboardInterrupt
-        interrupted = True
 
     bar = Progress(
         TextColumn("step"),
@@ -294,6 +312,10 @@ def _progress(total: int):
                     raise KeyboardInterrupt
 
             yield advance
+    except Exception:
+        if interrupted:  # some libraries turn an interrupt into an error of their own, or lose it: `advance` raises it then
+            raise KeyboardInterrupt from None
+        raise
     finally:
         signal.signal(signal.SIGINT, previous)
 
@@ -572,17 +594,18 @@ def scenes(plain: Annotated[bool, typer.Option("--plain", help="Names only, one 
 @command()
 def view(
     what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run folder to play, or a scene to simulate live.")],
-    port: Annotated[int, typer.Option(help="Port of the page.")] = 8080,
+    host: Annotated[str, typer.Option(help='Who may watch: "localhost", or "0.0.0.0" for other machines too.')] = "localhost",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page; if it is taken, the next free one.")] = 8080,
     device: Annotated[str | None, typer.Option(help='"cpu" or "cuda:0".')] = None,
 ) -> None:
-    """Watch a run, or a scene while it is simulated, in the browser."""
+    """Watch a run, or a scene while it is simulated, in the browser; there, bodies can be dragged with the mouse."""
     from pdipc import viewer
     from pdipc.output.results import open_run
 
     if Path(what).is_dir():
-        viewer.play(open_run(what), port=port)
+        viewer.play(open_run(what), host, port)
     else:
-        viewer.simulate(load(what), port=port, device=device)
+        viewer.simulate(load(what), host, port, device)
 
 
 @command()

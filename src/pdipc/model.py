@@ -268,6 +268,7 @@ def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
     stiff, dense = (
         (of.young_modulus, of.density) if isinstance(of, SolidMaterial) else (of.membrane_stiffness, of.areal_density)
     )
+    assert stiff is not None  # the schema fills it in
     return float(np.sqrt(stiff / dense))
 
 

@@ -75,7 +75,8 @@ class Simulation:
         return _merge(results)
 
     def reset(self) -> None:
-        """Back to the start."""
+        """Back to the start, with no vertex pulled."""
+        self.set_vertex_force(np.zeros(0), np.zeros((0, 3)))
         self.state = self.model.initial_state()
         self.work.candidates.invalidate()
 

@@ -114,7 +114,7 @@ def test_selections(select, expected):
 
 def test_selections_keep_to_their_body():
     cloth = Cloth(name="c", mesh=GRID, pins=[Pin(select=Selection(vertices=[25]))])
-    with pytest.raises(SceneError, match=r'body "c", pins\[0\]: vertex 25 is out of range; it has the vertices 0 to 24'):
+    with pytest.raises(SceneError, match=r'body "c", pins\[0\]: vertex 25 is out of range; body "c" has the vertices 0 to 24'):
         assemble(Scene(bodies=[cloth]))
 
 

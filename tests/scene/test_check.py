@@ -29,6 +29,7 @@ from pdipc.scene.schema import (
     Selection,
     Solid,
     VertexForce,
+    Wind,
 )
 
 BOX = generators.Box(size=(1, 1, 1), cells=(2, 2, 2))
@@ -108,7 +109,11 @@ def test_obstacles_may_overlap_each_other():
         ([[0, 1, 2, 3], [0, 1, 2, 4]], [*TET, [0.3, 0.3, 0.0]], "1 of 2 tets have no volume, first tets[1] = [0, 1, 2, 4]"),
         ([[0, 1, 2, 3], [1, 2, 0, 3]], TET, "1 tets are there more than once"),
         ([[0, 1, 2, 3]], [*TET, [5, 5, 5]], "1 vertices belong to no tet, first vertex 4"),
-        ([[0, 1, 2, 3]], TET * [[1], [np.nan], [1], [1]], "rest_positions of 1 vertices are not finite, first vertex 1"),
+        (
+            [[0, 1, 2, 3]],
+            TET * [[1], [np.nan], [1], [1]],
+            "rest_positions of 1 vertices are not finite, first vertex 1 = [nan, nan, nan]",
+        ),
     ],
 )
 def test_bad_tets(tets, vertices, message):
@@ -132,9 +137,11 @@ def test_bad_triangles(triangles, message):
 def test_selections_of_nothing():
     cloth = Cloth(name="c", mesh=GRID, pins=[Pin(select=NOWHERE)])
     force = VertexForce(body="c", select=NOWHERE, force=(1, 0, 0))
-    text = findings(cloth, forces=[force], attachments=[Attachment(bodies=("c", "c"), pairs=[(1, 1)])])
-    assert 'body "c": a pin selects no vertex' in text
-    assert "forces[0]: acts on no vertex" in text
+    wind = Wind(velocity=(1, 0, 0))
+    text = findings(cloth, forces=[wind, force], attachments=[Attachment(bodies=("c", "c"), pairs=[(1, 1)])])
+    reach = 'selects no vertex; body "c" reaches from (-0.5, 0, -0.5) to (0.5, 0, 0.5) m at the start'
+    assert f'body "c", pins[0].select = {NOWHERE}: {reach}' in text
+    assert f"forces[1].select = {NOWHERE}: {reach}" in text
     assert "attachments[0]: attaches a vertex to itself" in text
     other = Cloth(name="d", mesh=GRID, translation=(0, 3, 0))
     assert "attachments[0]: attaches no vertex" in findings(cloth, other, attachments=[Attachment(bodies=("c", "d"), within=1)])
@@ -157,7 +164,7 @@ def test_inside_each_other(large):
         assert text.startswith('body "s": starts inside obstacle "o", at (')
     else:
         text = findings(Solid(name="s", mesh=BOX), obstacles=[Obstacle(name="o", **small)])
-        assert text.startswith('obstacle "o": starts inside body "s", at (')
+        assert text.startswith('obstacle "o": starts inside body "s", at (') and text.endswith("move it out")
 
 
 def test_an_obstacle_that_faces_inward_is_a_container():
@@ -190,6 +197,30 @@ def test_unreadable_meshes_are_found_together():
     text = findings(Solid(name="a", mesh="nowhere.msh"), Solid(name="b", mesh=GRID), Cloth(name="c", mesh=GRID))
     assert 'body "a": mesh file "nowhere.msh": there is no such file' in text
     assert 'body "b": a solid needs tetrahedra' in text
+
+
+def test_everything_is_found_at_once_though_a_mesh_and_names_are_missing():
+    unread = Solid(name="unread", mesh="nowhere.msh")
+    held = Solid(name="held", mesh=BOX, pins=[Pin(select=NOWHERE), Pin(select=Selection(vertices=[10**6]))])
+    within = Solid(name="within", mesh=BOX, translation=(0.5, 0, 0))
+    scene = Scene(
+        bodies=[unread, held, within],
+        attachments=[Attachment(bodies=("held", name), pairs=[(0, 0)]) for name in ("unread", "unknown")],
+        forces=[VertexForce(body="within", select=Selection(vertices=[10**6]), force=(1, 0, 0))],
+    )
+    text = "\n".join(map(str, check(scene)))
+    for line in (
+        'body "unread": mesh file "nowhere.msh": there is no such file',
+        'body "held", pins[1]: vertex 1000000 is out of range',
+        'attachments[1]: there is no body "unknown"; there are: held, within',
+        "forces[0]: vertex 1000000 is out of range",
+        'body "held", pins[0].select = ',
+        'body "held" and body "within": ',
+    ):
+        assert line in text
+    assert len(text.splitlines()) == 6
+    with pytest.raises(SceneError, match="cannot be put together, 4 things"):
+        assemble(scene)
 
 
 def test_refuse_says_everything_in_one_error():

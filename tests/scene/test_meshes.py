@@ -35,6 +35,9 @@ def test_tets_from_tetgen_files(tmp_path, first):
     (tmp_path / "ball.ele").write_text(f"{len(BALL.tets)} 4 0\n{elements}\n")
     for name in ("ball.node", "ball.ele"):
         assert np.array_equal(meshes.read(tmp_path / name).tets, BALL.tets)
+    (tmp_path / "ball.ele").write_text(f"{len(BALL.tets) + 1} 4 0\n{elements}\n")
+    with pytest.raises(SceneError, match=rf"says {len(BALL.tets) + 1} rows, and {len(BALL.tets)} are there"):
+        meshes.read(tmp_path / "ball.node")
     (tmp_path / "ball.ele").unlink()
     with pytest.raises(SceneError, match=r'needs "ball\.ele" beside it'):
         meshes.read(tmp_path / "ball.node")
@@ -93,6 +96,8 @@ def test_a_surface_is_filled_with_tets():
     volumes = meshes.tet_volumes(solid.vertices, solid.tets)
     assert volumes.min() > 0
     assert volumes.sum() == pytest.approx(1.0, rel=2e-2)
+    with pytest.raises(SceneError, match=r"here: .* no inside to fill; the surface must be closed, and 4 of its edges"):
+        meshes.tetrahedralize(generators.Plane().mesh(), "here")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +106,15 @@ def test_a_surface_is_filled_with_tets():
         ("a.xyz", "", r'the format ".xyz" is not known; allowed: .msh'),
         ("a.obj", None, "there is no such file"),
         ("a.msh", "nonsense", "cannot be read as .msh"),
+        ("a.vtk", "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n", "cannot be read as .vtk: .*POLYDATA"),
+        (
+            "a.mesh",
+            "MeshVersionFormatted 2\nDimension 3\nVertices\n1\n0 0 0 0\nEnd\n",
+            "cells of the kinds none; needed: tetra",
+        ),
         ("a.ply", "nonsense", "cannot be read as .ply"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no triangles"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "(out of range|index 8 is out of bounds)"),
     ],
 )
 def test_what_cannot_be_read_is_refused(tmp_path, name, content, message):
@@ -119,8 +132,14 @@ def test_what_cannot_be_read_is_refused(tmp_path, name, content, message):
         ([[0, 1, 2, -1]], None, r"tets\[0\] = .* out of range"),
         (None, None, "neither triangles nor tetrahedra"),
         (None, [[0.5, 1, 2]], "whole numbers"),
+        (None, [["a", "b", "c"]], "whole numbers"),
     ],
 )
 def test_bad_arrays_are_refused(tets, triangles, message):
     with pytest.raises(SceneError, match=message):
         meshes.from_arrays(np.eye(4, 3), tets, triangles, "here")
+
+
+def test_vertices_that_are_no_numbers_are_refused():
+    with pytest.raises(SceneError, match="here: vertices must be numbers"):
+        meshes.from_arrays(np.array([["a", "b", "c"]]), None, [[0, 0, 0]], "here")

@@ -102,6 +102,6 @@ class PairList:
         average = 2 * found // max(1, self.primitives)
         if average > self.room:
             self._room_for_slots(min(average, MOST_SLOTS))
-        self.pairs = None
+        del self.pairs  # freed before the larger one is made
         self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
         return True

@@ -1,5 +1,7 @@
 """A scene as arrays: one numbering of all vertices, simulated and kinematic, and what is known about them."""
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,6 +14,7 @@ from pdipc.scene.meshes import Mesh
 from pdipc.scene.motion import Trajectory, rotation_matrix
 from pdipc.scene.schema import (
     Arrays,
+    Attachment,
     Body,
     Cloth,
     ClothMaterial,
@@ -21,6 +24,7 @@ from pdipc.scene.schema import (
     Selection,
     Solid,
     SolidMaterial,
+    VertexForce,
     Wind,
 )
 
@@ -56,8 +60,12 @@ class AssembledBody:
 
 @dataclass
 class AssembledPin:
-    """Held vertices (k,) int32. trajectory: how their points move. stiffness: N/m a vertex, or None: held exactly."""
+    """Held vertices (k,) int32. trajectory: how their points move. stiffness: N/m a vertex, or None: held exactly.
 
+    where: the pin and its selection, for messages.
+    """
+
+    where: str
     body: str
     vertices: np.ndarray
     trajectory: Trajectory
@@ -66,8 +74,9 @@ class AssembledPin:
 
 @dataclass
 class AssembledAttachment:
-    """Springs between vertices_a (k,) and vertices_b (k,) int32 of stiffness N/m and rest_lengths (k,) m."""
+    """Springs between vertices_a (k,) and vertices_b (k,) int32 of stiffness N/m and rest_lengths (k,) m; where, for messages."""
 
+    where: str
     vertices_a: np.ndarray
     vertices_b: np.ndarray
     stiffness: float
@@ -88,8 +97,10 @@ class AssembledWind:
 
 @dataclass
 class AssembledForce:
-    """The force (3,) N on each of vertices (k,) int32, from start to end, s (end may be inf)."""
+    """The force (3,) N on each of vertices (k,) int32, from start to end, s (end may be inf); where, for messages."""
 
+    where: str
+    body: str
     vertices: np.ndarray
     force: np.ndarray
     start: float
@@ -209,13 +220,32 @@ def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
 def assemble(scene: Scene) -> Assembly:
     """Reads the meshes of `scene`, places them, and numbers everything.
 
-    Raises SceneError where a mesh cannot be read, or a name or index is unknown. What is wrong with the geometry is for
-    `pdipc.scene.check` to find.
+    Raises SceneError with all meshes that cannot be read, and all names and indices that are unknown. What is wrong with the
+    geometry is for `pdipc.scene.check` to find.
     """
+    assembly, problems = gather(scene)
+    if assembly is None or problems:
+        listed = [f"the scene cannot be put together, {len(problems)} things to put right:", *problems]
+        raise SceneError(problems[0] if len(problems) == 1 else "\n  ".join(listed))
+    return assembly
+
+
+def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
+    """What `assemble` makes, of all that can be read and is known, and a line for each thing that is not.
+
+    None where not a single body can be read.
+    """
+    problems: list[str] = []
+    unread: set[str] = set()  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
     first = 0
     for placed in (*scene.bodies, *scene.obstacles):
-        mesh, start = load_mesh(placed)
+        try:
+            mesh, start = load_mesh(placed)
+        except SceneError as error:
+            problems.append(str(error))
+            unread.add(placed.name)
+            continue
         matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
         rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
         for name, offset in _copies(placed):
@@ -238,8 +268,10 @@ def assemble(scene: Scene) -> Assembly:
             first = body.last
 
     bodies = [part[0] for part in parts]
+    if all(body.kinematic for body in bodies):
+        return None, problems
     positions = np.concatenate([part[3] for part in parts])
-    deformable = positions[: max((body.last for body in bodies if not body.kinematic), default=0)]
+    deformable = positions[: max(body.last for body in bodies if not body.kinematic)]
     scene_size = float(np.linalg.norm(np.ptp(deformable, axis=0)))
     activation_distance = scene.contact.activation_distance or ACTIVATION_PART * scene_size
     minimum_separation = scene.contact.minimum_separation or SEPARATION_PART * activation_distance
@@ -259,13 +291,35 @@ def assemble(scene: Scene) -> Assembly:
             body.trajectory = Trajectory(placed.motion, _middle(start))
         else:
             for number, pin in enumerate(placed.pins):
-                vertices = _select(assembly, body, pin.select, f"pins[{number}]")
-                trajectory = Trajectory(pin.motion, _middle(positions[vertices]))
-                assembly.pins.append(AssembledPin(body.name, vertices, trajectory, pin.stiffness))
+                where = f'body "{body.name}", pins[{number}]'
+                with _noting(problems):
+                    vertices = _select(assembly, body, pin.select, where)
+                    trajectory = Trajectory(pin.motion, _middle(positions[vertices]))
+                    where += f".select = {pin.select}"
+                    assembly.pins.append(AssembledPin(where, body.name, vertices, trajectory, pin.stiffness))
     assembly.velocities[assembly.kinematic_vertices] = 0.0
-    _attach(assembly, scene)
-    _force(assembly, scene)
-    return assembly
+    for number, attachment in enumerate(scene.attachments):
+        with _noting(problems):
+            if _known(attachment.bodies, unread):
+                _attach(assembly, attachment, f"attachments[{number}]")
+    for number, force in enumerate(scene.forces):
+        with _noting(problems):
+            if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
+                _force(assembly, force, f"forces[{number}]")
+    return assembly, problems
+
+
+@contextmanager
+def _noting(problems: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except SceneError as error:
+        problems.append(str(error))
+
+
+def _known(names: Iterable[str], unread: set[str]) -> bool:
+    """Whether none of the bodies, or copies of bodies, is among the unread."""
+    return not any(name in unread or name.rpartition("[")[0] in unread for name in names)
 
 
 def _copies(placed: Placed) -> list[tuple[str, np.ndarray]]:
@@ -308,40 +362,40 @@ def _in_range(body: AssembledBody, vertices: list[int], where: str) -> None:
     count = body.last - body.first
     beyond = [vertex for vertex in vertices if not 0 <= vertex < count]
     if beyond:
-        raise SceneError(
-            f'body "{body.name}", {where}: vertex {beyond[0]} is out of range; it has the vertices 0 to {count - 1}'
-        )
+        raise SceneError(f"{where}: vertex {beyond[0]} is out of range; {_label(body)} has the vertices 0 to {count - 1}")
 
 
-def _attach(assembly: Assembly, scene: Scene) -> None:
-    for number, table in enumerate(scene.attachments):
-        where = f"attachments[{number}]"
-        a, b = (_body(assembly, name, where) for name in table.bodies)
-        if table.pairs is not None:
-            pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
-            _in_range(a, pairs[:, 0].tolist(), where)
-            _in_range(b, pairs[:, 1].tolist(), where)
-        else:
-            near = cKDTree(assembly.positions[b.first : b.last])
-            distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
-            chosen = np.flatnonzero(np.isfinite(distance))
-            pairs = np.column_stack([chosen, nearest[chosen]])
-        vertices_a, vertices_b = (pairs[:, 0] + a.first).astype(np.int32), (pairs[:, 1] + b.first).astype(np.int32)
-        lengths = np.linalg.norm(assembly.positions[vertices_a] - assembly.positions[vertices_b], axis=1)
-        if table.rest_length is not None:
-            lengths = np.full(len(pairs), table.rest_length)
-        assembly.attachments.append(AssembledAttachment(vertices_a, vertices_b, table.stiffness, lengths))
+def _label(body: AssembledBody) -> str:
+    return f'{"obstacle" if body.kinematic else "body"} "{body.name}"'
 
 
-def _force(assembly: Assembly, scene: Scene) -> None:
-    for number, table in enumerate(scene.forces):
-        where, end = f"forces[{number}]", np.inf if table.end is None else table.end
-        if isinstance(table, Wind):
-            names = [body.name for body in assembly.bodies if not body.kinematic] if table.bodies is None else table.bodies
-            triangles = np.concatenate([_body(assembly, name, where).triangles for name in names])
-            wind = AssembledWind(triangles, np.array(table.velocity), table.air_density, table.drag, table.start, end)
-            assembly.winds.append(wind)
-        else:
-            vertices = _select(assembly, _body(assembly, table.body, where), table.select, where)
-            share = np.array(table.force) / max(1, len(vertices))
-            assembly.forces.append(AssembledForce(vertices, share, table.start, end))
+def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
+    a, b = (_body(assembly, name, where) for name in table.bodies)
+    if table.pairs is not None:
+        pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
+        _in_range(a, pairs[:, 0].tolist(), where)
+        _in_range(b, pairs[:, 1].tolist(), where)
+    else:
+        near = cKDTree(assembly.positions[b.first : b.last])
+        distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
+        chosen = np.flatnonzero(np.isfinite(distance))
+        pairs = np.column_stack([chosen, nearest[chosen]])
+    vertices_a, vertices_b = (pairs[:, 0] + a.first).astype(np.int32), (pairs[:, 1] + b.first).astype(np.int32)
+    lengths = np.linalg.norm(assembly.positions[vertices_a] - assembly.positions[vertices_b], axis=1)
+    if table.rest_length is not None:
+        lengths = np.full(len(pairs), table.rest_length)
+    assembly.attachments.append(AssembledAttachment(where, vertices_a, vertices_b, table.stiffness, lengths))
+
+
+def _force(assembly: Assembly, table: Wind | VertexForce, where: str) -> None:
+    end = np.inf if table.end is None else table.end
+    if isinstance(table, Wind):
+        names = [body.name for body in assembly.bodies if not body.kinematic] if table.bodies is None else table.bodies
+        triangles = np.concatenate([_body(assembly, name, where).triangles for name in names])
+        wind = AssembledWind(triangles, np.array(table.velocity), table.air_density, table.drag, table.start, end)
+        assembly.winds.append(wind)
+    else:
+        vertices = _select(assembly, _body(assembly, table.body, where), table.select, where)
+        share = np.array(table.force) / max(1, len(vertices))
+        where += f".select = {table.select}"
+        assembly.forces.append(AssembledForce(where, table.body, vertices, share, table.start, end))

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pdipc import boxes
 from pdipc.scene import meshes
-from pdipc.scene.assembly import AssembledBody, Assembly, assemble, load_mesh
+from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.errors import SceneError
 from pdipc.scene.schema import Scene
 from pdipc.witness import find_intersections
@@ -20,14 +20,16 @@ SEPARATION_ULPS = 100  # a minimum separation of fewer roundings of a coordinate
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that must be put right. where: bodies or keys. found: what is wrong. right: what would be right."""
+    """Something that must be put right. where: bodies or keys. found: what is wrong. right: what would be right, if that is not
+    in `found`.
+    """
 
     where: str
     found: str
-    right: str
+    right: str = ""
 
     def __str__(self) -> str:
-        return f"{self.where}: {self.found}; {self.right}"
+        return f"{self.where}: {self.found}" + (f"; {self.right}" if self.right else "")
 
 
 def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding]:
@@ -37,19 +39,15 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     """
     if isinstance(scene, Assembly):
         return _check(scene, precision or "float64")
+    assembly, problems = gather(scene)
     findings = []
-    for placed in (*scene.bodies, *scene.obstacles):
-        try:
-            load_mesh(placed)
-        except SceneError as error:
-            findings.append(Finding("meshes", str(error), "put this right first"))
-    if findings:
+    for problem in problems:
+        where, _, found = problem.partition(": ")
+        findings.append(Finding(where, found))
+    if assembly is None:
         return findings
-    try:
-        assembly = assemble(scene)
-    except SceneError as error:
-        return [Finding("scene", str(error), "put this right first")]
-    return _check(assembly, precision or ("float32" if scene.simulation.precision == "float32" else "float64"))
+    precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
+    return findings + _check(assembly, precision, complete=not problems)
 
 
 def refuse(scene: Scene | Assembly, precision: str | None = None) -> None:
@@ -65,7 +63,8 @@ def smallest_separation(assembly: Assembly, precision: str) -> float:
     return float(SEPARATION_ULPS * np.spacing(np.abs(assembly.positions).max().astype(precision)))
 
 
-def _check(assembly: Assembly, precision: str) -> list[Finding]:
+def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Finding]:
+    """complete: False where bodies are missing, so that the scene size is not known, and no distance that follows from it."""
     findings = [finding for body in assembly.bodies for finding in _numbers(assembly, body)]
     if findings:  # geometry is meaningless then
         return findings
@@ -73,9 +72,11 @@ def _check(assembly: Assembly, precision: str) -> list[Finding]:
         findings += _elements(assembly, body)
     findings += _selections(assembly)
     findings += _motions(assembly)
-    findings += _separation(assembly, precision)
     touching, found = _intersections(assembly)
-    return findings + found + list(_too_close(assembly, touching)) + list(_inside(assembly, touching))
+    findings += found
+    if complete:
+        findings += [*_separation(assembly, precision), *_too_close(assembly, touching)]
+    return findings + list(_inside(assembly, touching))
 
 
 def _label(body: AssembledBody) -> str:
@@ -90,9 +91,9 @@ def _numbers(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     for name in ("rest_positions", "positions", "velocities"):
         bad = np.flatnonzero(~np.isfinite(getattr(assembly, name)[body.first : body.last]).all(axis=1))
         if len(bad):
-            yield Finding(
-                _label(body), f"{name} of {len(bad)} vertices are not finite, first vertex {bad[0]}", "they must be numbers"
-            )
+            value = getattr(assembly, name)[body.first + bad[0]].tolist()
+            found = f"{name} of {len(bad)} vertices are not finite, first vertex {bad[0]} = {value}"
+            yield Finding(_label(body), found, "they must be numbers")
             return
 
 
@@ -137,32 +138,33 @@ def _selections(assembly: Assembly) -> Iterator[Finding]:
     held: dict[int, str] = {}
     for number, pin in enumerate(assembly.pins):
         if len(pin.vertices) == 0:
-            yield Finding(
-                f'body "{pin.body}"',
-                "a pin selects no vertex",
-                "places are those at the start, in m, in the scene's coordinates",
-            )
+            yield _nothing(assembly, pin.where, pin.body)
         elif pin.stiffness is None:
             twice = [vertex for vertex in pin.vertices.tolist() if vertex in held]
             if twice:
                 found = f"{len(twice)} vertices are held exactly by more than one pin"
-                yield Finding(f'body "{pin.body}"', found, "give them one pin, or all but one a stiffness")
+                yield Finding(pin.where, found, "give them one pin, or all but one a stiffness")
             held.update((vertex, str(number)) for vertex in pin.vertices.tolist())
-    for number, attachment in enumerate(assembly.attachments):
+    for attachment in assembly.attachments:
         if len(attachment.vertices_a) == 0:
-            yield Finding(f"attachments[{number}]", "attaches no vertex", 'raise "within", or give pairs')
+            yield Finding(attachment.where, "attaches no vertex", 'raise "within", or give pairs')
         elif np.any(attachment.vertices_a == attachment.vertices_b):
-            yield Finding(f"attachments[{number}]", "attaches a vertex to itself", "give two different vertices")
-    for number, force in enumerate(assembly.forces):
+            yield Finding(attachment.where, "attaches a vertex to itself", "give two different vertices")
+    for force in assembly.forces:
         if len(force.vertices) == 0:
-            yield Finding(
-                f"forces[{number}]", "acts on no vertex", "places are those at the start, in m, in the scene's coordinates"
-            )
+            yield _nothing(assembly, force.where, force.body)
+
+
+def _nothing(assembly: Assembly, where: str, name: str) -> Finding:
+    (body,) = (body for body in assembly.bodies if body.name == name)
+    points = assembly.positions[body.first : body.last]
+    right = f"{_label(body)} reaches from {_at(points.min(axis=0))} to {_at(points.max(axis=0))} m at the start"
+    return Finding(where, "selects no vertex", right)
 
 
 def _motions(assembly: Assembly) -> Iterator[Finding]:
     scripts = [(_label(body), slice(body.first, body.last), body.trajectory) for body in assembly.bodies if body.trajectory]
-    for label, vertices, trajectory in scripts + [(f'body "{p.body}", a pin', p.vertices, p.trajectory) for p in assembly.pins]:
+    for label, vertices, trajectory in scripts + [(pin.where, pin.vertices, pin.trajectory) for pin in assembly.pins]:
         start = assembly.positions[vertices]
         jump = np.linalg.norm(trajectory.apply(start, 0.0) - start, axis=1).max(initial=0.0)
         if jump > 1e-9 * assembly.scene_size:
@@ -179,7 +181,9 @@ def _separation(assembly: Assembly, precision: str) -> Iterator[Finding]:
         reach = np.abs(assembly.positions).max()
         gap = 2 * small[0].half_separation
         found = f"minimum separation {gap:.3g} m is lost in the rounding of {precision} coordinates up to {reach:.4g} m"
-        right = f"it must be at least {least:.3g} m: raise minimum_separation or activation_distance, or use float64"
+        right = f"it must be at least {least:.3g} m: raise minimum_separation or activation_distance, or move the scene to the origin"
+        if precision == "float32":
+            right += ", or use float64"
         yield Finding(", ".join(map(_label, small[:5])), found, right)
 
 
@@ -260,9 +264,8 @@ def _inside(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Find
             for vertex in parts[j]:
                 if np.all(low < x[vertex]) and np.all(x[vertex] < high) and winding_number(x[vertex], corners) > 0.5:
                     found = f"starts inside {_label(outer)}, at {_at(x[vertex])} m"
-                    yield Finding(
-                        _label(inner), found, "move it out; an obstacle that is to hold bodies must face inward or be open"
-                    )
+                    right = "; an obstacle that is to hold bodies must face inward or be open" if outer.kinematic else ""
+                    yield Finding(_label(inner), found, "move it out" + right)
                     break
 
 

@@ -70,21 +70,17 @@ def _line(problem: Any, data: Any) -> tuple[str, str, str]:
     if kind == "missing":
         return where, "is missing", _about(keys, models)
     if kind == "union_tag_not_found":
-        return where, f"needs kind = {_kinds(problem)}", ""
+        return where, f"needs kind = {_kinds(keys)}", ""
     if kind == "union_tag_invalid":
-        return f'{where}.kind = "{problem["ctx"]["tag"]}"', f"must be {_kinds(problem)}", ""
+        return f'{where}.kind = "{problem["ctx"]["tag"]}"', f"must be {_kinds(keys)}", ""
     said = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("should", "must")
-    value = "" if isinstance(problem["input"], BaseModel) else f" = {found}"
+    said = said.replace("valid tuple", "list").replace("valid list", "list").replace("valid dictionary", "table")
+    value = "" if isinstance(problem["input"], BaseModel) or not keys else f" = {found}"
     return where + value, said, _about(keys, models)
 
 
-def _kinds(problem: Any) -> str:
-    tags = problem.get("ctx", {}).get("expected_tags")
-    return (
-        tags.replace("'", '"').replace(", ", " or ")
-        if tags
-        else '"solid" or "cloth" for a body, "wind" or "vertices" for a force'
-    )
+def _kinds(keys: list[str | int]) -> str:
+    return '"solid" or "cloth"' if keys[0] == "bodies" else '"wind" or "vertices"'
 
 
 def _about(keys: list[str | int], models: list[type[BaseModel]]) -> str:

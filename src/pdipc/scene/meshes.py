@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import io
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,7 +107,7 @@ def read(name: str | Path) -> Mesh:
             vertices, tets, triangles = _read_trimesh(path)
     except SceneError:
         raise
-    except (Exception, SystemExit) as error:  # meshio ends the process on some malformed files
+    except Exception as error:
         raise SceneError(f'mesh file "{path}": cannot be read as {suffix}: {error}') from error
     return from_arrays(vertices, tets, triangles, f'mesh file "{path}"')
 
@@ -118,7 +119,10 @@ def from_arrays(
 
     A whole mesh of negative tets is an orientation convention and is turned; mixed signs are left for the check to report.
     """
-    vertices = np.array(vertices, dtype=np.float64)
+    try:
+        vertices = np.array(vertices, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{where}: vertices must be numbers: {error}") from error
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
         raise SceneError(f"{where}: vertices have the shape {vertices.shape}; they must be (n, 3) with n > 0")
     kind, elements, width = ("tets", tets, 4) if tets is not None and len(tets) else ("triangles", triangles, 3)
@@ -127,7 +131,7 @@ def from_arrays(
         raise SceneError(f"{where}: holds neither triangles nor tetrahedra")
     if elements.ndim != 2 or elements.shape[1] != width:
         raise SceneError(f"{where}: {kind} have the shape {elements.shape}; they must be (m, {width})")
-    if not np.all(elements == np.floor(elements)):
+    if elements.dtype.kind not in "iuf" or not np.all(elements == np.floor(elements)):
         raise SceneError(f"{where}: {kind} must be whole numbers")
     elements = elements.astype(np.int64)
     if elements.min() < 0 or elements.max() >= len(vertices):
@@ -154,8 +158,17 @@ def _read_npz(path: Path):
 def _read_meshio(path: Path):
     import meshio
 
-    mesh = meshio.read(path)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            mesh = meshio.read(path)
+    except SystemExit as error:  # meshio prints what is wrong and ends the process on some files
+        raise ValueError(" ".join(said.getvalue().split())) from error
     cells = mesh.cells_dict
+    if not {"tetra", "triangle"} & set(cells):
+        raise SceneError(
+            f'mesh file "{path}": holds cells of the kinds {", ".join(cells) or "none"}; needed: tetra (of four vertices) or triangle'
+        )
     return _three(mesh.points), cells.get("tetra"), cells.get("triangle")
 
 
@@ -168,21 +181,25 @@ def _read_trimesh(path: Path):
 
     # merge_norm and merge_tex: a mesh cut along seams of its normals or textures is one surface here
     mesh = trimesh.load(path, force="mesh", process=False)
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    if len(mesh.faces) == 0:
+        raise SceneError(f'mesh file "{path}": holds no triangles')
+    if np.isfinite(mesh.vertices).all() and mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices):
+        mesh.merge_vertices(merge_norm=True, merge_tex=True)
     return mesh.vertices, None, mesh.faces
 
 
 def _read_tetgen(path: Path):
-    def rows(file: Path) -> tuple[np.ndarray, int]:
+    def rows(file: Path) -> np.ndarray:
         if not file.is_file():
             raise SceneError(f'mesh file "{path}": needs "{file.name}" beside it')
         lines = [line.split("#")[0].split() for line in file.read_text().splitlines()]
         lines = [line for line in lines if line]
         count = int(lines[0][0])
-        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]]), count
+        if len(lines) <= count:
+            raise SceneError(f'mesh file "{file}": its first line says {count} rows, and {len(lines) - 1} are there')
+        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]])
 
-    nodes, _ = rows(path.with_suffix(".node"))
-    elements, _ = rows(path.with_suffix(".ele"))
+    nodes, elements = rows(path.with_suffix(".node")), rows(path.with_suffix(".ele"))
     return nodes[:, 1:4], elements[:, 1:5] - nodes[0, 0], None
 
 
@@ -220,4 +237,11 @@ def tetrahedralize(mesh: Mesh, where: str) -> Mesh:
         ) from error
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it works
         vertices, tets = pytetwild.tetrahedralize(mesh.vertices, mesh.triangles, optimize=True)[:2]  # pyright: ignore
+    if len(tets) == 0:
+        sides = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        rim = int(np.count_nonzero(np.unique(sides, axis=0, return_counts=True)[1] == 1))
+        raise SceneError(
+            f'{where}: "tetrahedralize" found no inside to fill; the surface must be closed, and {rim} of its edges belong to one '
+            "triangle only"
+        )
     return from_arrays(vertices, tets, None, f"{where}, tetrahedralized")

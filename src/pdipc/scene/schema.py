@@ -345,6 +345,10 @@ class Selection(Table):
             raise ValueError(f"box: the lower corner {self.box[0]} is above the upper corner {self.box[1]}")
         return self
 
+    def __str__(self) -> str:
+        """As it is written in a scene, such as "{ sphere = ((0.0, 0.0, 0.0), 1.0) }"."""
+        return "".join(f"{{ {name} = {value} }}" for name, value in self if value not in (None, False))
+
 
 class Pin(Table):
     """Vertices held where they start, or led along a motion."""
@@ -443,7 +447,9 @@ class Wind(_Window):
     velocity: Vector = Field(description="Velocity of the air, m/s.")
     air_density: Positive = Field(default=1.2, description="kg/m^3.")
     drag: NotNegative = Field(default=1.0, description="Drag coefficient.")
-    bodies: list[str] | None = Field(default=None, description="Names of the bodies that feel it; absent: all.")
+    bodies: Annotated[list[str], Field(min_length=1)] | None = Field(
+        default=None, description="Names of the bodies that feel it; absent: all."
+    )
 
 
 class VertexForce(_Window):
