@@ -1,22 +1,26 @@
 """One command for a machine with a GPU: checks CUDA against the CPU, then times it: `python benchmarks/gpu.py [-o FILE]`.
 
-It needs a checkout and the package's own dependencies. It checks that solvers, CCD and whole steps give on CUDA what they give on the CPU, that
+It needs a checkout and the package's own dependencies; the package need not be installed. It checks that solvers, CCD and whole steps give on CUDA what they give on the CPU, that
 two runs give the same bits, and recorded steps those of single launches. Then it times the solvers over sizes (Fig. 8), CCD, the
 benchmark scenes stage by stage, the authors' Armadillo (Table 1) where the optional data is there, and says how near the solver's
-sweep comes to a measured copy. It ends within nine minutes: what no longer fits is left out, and the JSON says so.
+sweep comes to a measured copy. It ends within nine minutes: what no longer fits is left out, and the JSON says so. Each part is
+a process of its own, and the JSON is written row by row: a part that breaks, hangs or spoils the GPU's context costs no other.
 
 Exit code 0: all is well; 1: a check failed or a part broke; 2: no CUDA device. `--device cpu --small` tries the command itself.
 """
 
 import argparse
 import datetime
+import functools
 import json
 import platform
 import re
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,13 +29,13 @@ import scipy.sparse.linalg as spla
 import warp as wp
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "benchmarks")]
+sys.path[:0] = [str(REPOSITORY / folder) for folder in ("src", ".", "benchmarks")]
 
 import pdipc  # noqa: E402
 from pdipc.linear import make_solver  # noqa: E402
 from pdipc.linear.solvers import SOLVERS  # noqa: E402
 from pdipc.parallel import Device  # noqa: E402
-from pdipc.precision import real  # noqa: E402
+from pdipc.precision import Real, real  # noqa: E402
 from pdipc.reproduce import _common, fig8  # noqa: E402
 from pdipc.reproduce.armadillo import authors_scene  # noqa: E402
 from pdipc.reproduce.fig7 import Run, loads, table_cloth  # noqa: E402
@@ -47,12 +51,15 @@ CHECKED_SCENES = ("box_stack", "cloth_on_sphere", "thin_rod")
 
 
 class Report:
-    """What was found: parts by name, each with rows; checks with the number measured and what it must not exceed."""
+    """What one part found: rows, and checks with the number measured and what it must not exceed; kept in a file as they come.
 
-    def __init__(self, budget: float):
-        self.begun, self.budget = time.perf_counter(), budget
+    budget: seconds that the part may take.
+    """
+
+    def __init__(self, budget: float, path: Path | None = None):
+        self.begun, self.budget, self.path = time.perf_counter(), budget, path
         self.checks: list[dict] = []
-        self.parts: dict[str, object] = {}
+        self.rows: list[dict] = []
 
     def left(self) -> float:
         """Seconds of the budget that are left."""
@@ -63,25 +70,32 @@ class Report:
         passed = bool(found <= limit)
         self.checks.append({"check": name, "found": float(found), "limit": limit, "passed": passed})
         print(f"  {'ok  ' if passed else 'FAIL'} {name}: {found:.3g} (at most {limit:g})", flush=True)
+        self._keep()
 
-    def part(self, name: str, needs: float, run: Callable[[], object]) -> None:
-        """Runs a part that takes about `needs` seconds, if they are left; what breaks it is kept."""
-        if self.left() < needs:
-            self.parts[name] = {"skipped": f"{self.left():.0f} s were left of {self.budget:.0f}"}
-            print(f"{name}: skipped, {self.left():.0f} s left", flush=True)
-            return
-        print(f"{name}  [{self.left():.0f} s left]", flush=True)
+    def add(self, **row) -> None:
+        """A row of the part's table."""
+        self.rows.append(row)
+        self._keep()
+
+    def attempt(self, name: str, work: Callable[[], object]) -> None:
+        """One case of several: what breaks it is noted, fails the report, and leaves the others their turn."""
         try:
-            self.parts[name] = run()
+            work()
         except Exception as error:
-            self.parts[name] = {"broken": f"{type(error).__name__}: {error}"}
-            print(f"  BROKEN {type(error).__name__}: {error}", flush=True)
+            traceback.print_exc()
+            self.add(case=name, broken=f"{type(error).__name__}: {error}")
 
-    @property
-    def ok(self) -> bool:
-        """Whether every check passed and no part broke."""
-        broken = any(isinstance(part, dict) and "broken" in part for part in self.parts.values())
-        return not broken and all(check["passed"] for check in self.checks)
+    def _keep(self) -> None:
+        if self.path is not None:
+            whole = self.path.with_suffix(".new")
+            whole.write_text(json.dumps({"checks": self.checks, "rows": self.rows}))
+            whole.replace(self.path)  # at no time is half a file there
+
+
+def sound(parts: dict[str, dict]) -> bool:
+    """Whether every check of every part passed and nothing broke."""
+    broken = any("broken" in part or any("broken" in row for row in part["rows"]) for part in parts.values())
+    return not broken and all(check["passed"] for part in parts.values() for check in part["checks"])
 
 
 # --- CUDA gives what the CPU gives ---
@@ -94,14 +108,22 @@ def check_solvers(report: Report, place: Device, side: int) -> None:
         b = loads(system, mass)["sharp force"]
         free, expected = system.free, np.zeros_like(b)
         expected[free] = spla.spsolve(system.matrix[free][:, free].tocsc(), b[free])
+        right = wp.array(b.astype(system.real.numpy), dtype=system.real.vec3, device=place.warp)
         for name in SOLVERS:
-            options = {"weight": 0.5} if name == "jacobi" else {}
-            tolerance = 1e-11 if precision == "float64" else 1e-6
-            solver = make_solver(name, system, tolerance=tolerance, max_iterations=40_000, **options)
-            x = wp.zeros(system.count, dtype=system.real.vec3, device=place.warp)
-            solver.solve(x, wp.array(b.astype(system.real.numpy), dtype=system.real.vec3, device=place.warp))
-            error = np.linalg.norm(x.numpy() - expected) / np.linalg.norm(expected)
-            report.check(f"solver {name}, {precision}, error", error, limit)
+
+            def one(name=name, precision=precision, limit=limit, system=system, right=right, expected=expected) -> None:
+                options = {"weight": 0.5} if name == "jacobi" else {}
+                tolerance = 1e-11 if precision == "float64" else 1e-6
+                solver = make_solver(name, system, tolerance=tolerance, max_iterations=40_000, **options)
+                x = wp.zeros(system.count, dtype=system.real.vec3, device=place.warp)
+                if solver.recordable and place.records_loops:
+                    place.capture(lambda: solver.solve(x, right), solver).launch()
+                else:
+                    solver.solve(x, right)
+                error = np.linalg.norm(x.numpy() - expected) / np.linalg.norm(expected)
+                report.check(f"solver {name}, {precision}, error", error, limit)
+
+            report.attempt(f"solver {name}, {precision}", one)
 
 
 def check_ccd(report: Report, place: Device, count: int) -> None:
@@ -129,20 +151,28 @@ def check_steps(report: Report, place: Device, names: tuple[str, ...], steps: in
     """Bundled scenes: CUDA against the CPU, no intersection, the same bits again, recorded and launch by launch."""
     for name in names:
         for precision in SOLVER_TOLERANCE:
-            scene = pdipc.load_scene(name)
-            scene = scene.model_copy(update={"simulation": scene.simulation.model_copy(update={"precision": precision})})
-            paths = {}
-            for label, device, recorded in (("cpu", "cpu", True), ("here", place.name, True), ("again", place.name, True)):
-                paths[label] = _positions(scene, device, steps, recorded)
-            paths["launched"] = _positions(scene, place.name, steps, recorded=False)
-            model = pdipc.build(scene, "cpu")
-            size = model.assembly.scene_size
             label = f"{name}, {precision}, {steps} steps:"
-            report.check(f"{label} CUDA against CPU / size", np.abs(paths["here"] - paths["cpu"]).max() / size, STEP_TOLERANCE)
-            found = pdipc.find_intersections(paths["here"], model.triangles, model.assembly.scripted)
-            report.check(f"{label} intersections", len(found), 0)
-            report.check(f"{label} bits that differ the second time", np.count_nonzero(paths["here"] != paths["again"]), 0)
-            report.check(f"{label} bits that differ unrecorded", np.count_nonzero(paths["here"] != paths["launched"]), 0)
+            if report.left() < 15:
+                report.add(case=label, skipped="no time left")
+                continue
+            report.attempt(label, functools.partial(check_scene, report, place, name, precision, steps, label))
+
+
+def check_scene(report: Report, place: Device, name: str, precision: str, steps: int, label: str) -> None:
+    """One scene of check_steps in one precision."""
+    scene = pdipc.load_scene(name)
+    # the same solver on both sides, whatever is the default of each
+    tables = {"precision": precision, "linear_solver": "pcg"}
+    scene = scene.model_copy(update={"simulation": scene.simulation.model_copy(update=tables)})
+    model = pdipc.build(scene, "cpu")
+    there = _positions(scene, "cpu", steps, recorded=True)
+    here = _positions(scene, place.name, steps, recorded=True)
+    report.check(f"{label} CUDA against CPU / size", np.abs(here - there).max() / model.assembly.scene_size, STEP_TOLERANCE)
+    found = pdipc.find_intersections(here, model.triangles, model.assembly.obstacle)
+    report.check(f"{label} intersections", len(found), 0)
+    for recorded, told in ((True, "the second time"), (False, "unrecorded")):
+        again = _positions(scene, place.name, steps, recorded)
+        report.check(f"{label} bits that differ {told}", np.count_nonzero(here != again), 0)
 
 
 def _positions(scene: pdipc.Scene, device: str, steps: int, recorded: bool) -> np.ndarray:
@@ -174,61 +204,58 @@ def _seconds(place: Device, action: Callable[[], object], repeats: int = 9) -> f
     return statistics.median(times[1:])
 
 
-def time_solvers(report: Report, place: Device, sides: tuple[int, ...]) -> list[dict]:
+def time_solvers(report: Report, place: Device, sides: tuple[int, ...]) -> None:
     """Fig. 8, and the bandwidth that a sweep of each solver reaches: bytes of the matrix and of the vectors that it must touch."""
     precision = real("float32" if place.is_cuda else "float64")
-    copied, rows = copy_bandwidth(place, 2**28 if place.is_cuda else 2**24), []
+    copied = copy_bandwidth(place, 2**28 if place.is_cuda else 2**24)
+    report.add(**{"copy GB/s": copied})
     print(f"  copy: {copied:.0f} GB/s")
     for side in sides:
-        if report.left() < 60:
-            rows.append({"dof": 3 * side * side, "skipped": "no time left"})
+        dof = 3 * side * side
+        if report.left() < 20 + 1.5e-4 * dof:  # setting up takes this long on the host
+            report.add(dof=dof, skipped="no time left")
             continue
-        for dof, label, terms, relative, memory in fig8.measure(side, place, precision):
-            rows.append({"dof": dof, "variant": label, "terms/s": terms, "relative to Jacobi": relative, "bytes": memory})
-            print(f"  {dof:9,} DOF  {label:34} {terms:12.0f} terms/s  {relative:5.2f} of Jacobi", flush=True)
-        system, mass, _ = table_cloth(side, place, precision)
-        b = loads(system, mass)["gravity"]
-        word = np.dtype(precision.numpy).itemsize
-        for name in ("chebyshev", "pcg"):
-            seconds = Run(system, b, name, {}).per_iteration()[1]
-            entries, vertices = system.rows.entries, system.count
-            # columns and values once; x, b, the last x and the new x; for PCG also the two vectors more that it keeps
-            touched = entries * (4 + word) + vertices * 3 * word * (4 if name == "chebyshev" else 8)
-            speed = touched / seconds / 1e9
-            row = {"dof": 3 * vertices, "sweep of": name, "us": 1e6 * seconds, "GB/s": speed, "of copy": speed / copied}
-            rows.append(row)
-            print(
-                f"  {row['dof']:9,} DOF  {name:34} {row['us']:9.1f} us  {speed:7.1f} GB/s, {speed / copied:.2f} of a copy",
-                flush=True,
-            )
-    return [{"copy GB/s": copied}, *rows]
+        report.attempt(f"{dof} DOF, sweeps", functools.partial(_time_sweeps, report, place, precision, side, copied))
+        report.attempt(f"{dof} DOF, Fig. 8", functools.partial(_time_series, report, place, precision, side))
 
 
-def time_ccd(place: Device, count: int) -> list[dict]:
-    """Nanoseconds a query, kernel and transfers, and of the kernel alone by the difference of two sizes."""
-    rng, rows = np.random.default_rng(1), []
+def _time_series(report: Report, place: Device, precision: Real, side: int) -> None:
+    for dof, label, terms, relative, memory in fig8.measure(side, place, precision):
+        report.add(**{"dof": dof, "variant": label, "terms/s": terms, "relative to Jacobi": relative, "bytes": memory})
+        print(f"  {dof:9,} DOF  {label:34} {terms:12.0f} terms/s  {relative:5.2f} of Jacobi", flush=True)
+
+
+def _time_sweeps(report: Report, place: Device, precision: Real, side: int, copied: float) -> None:
+    system, mass, _ = table_cloth(side, place, precision)
+    b = loads(system, mass)["gravity"]
+    word = np.dtype(precision.numpy).itemsize
+    for name in ("chebyshev", "pcg"):
+        seconds = Run(system, b, name, {}).per_iteration()[1]
+        entries, vertices = system.rows.entries, system.count
+        # columns and values once; x, b, the last x and the new x; for PCG also the two vectors more that it keeps
+        touched = entries * (4 + word) + vertices * 3 * word * (4 if name == "chebyshev" else 8)
+        speed = touched / seconds / 1e9
+        us = 1e6 * seconds
+        report.add(**{"dof": 3 * vertices, "sweep of": name, "us": us, "GB/s": speed, "of copy": speed / copied})
+        told = f"{us:9.1f} us  {speed:7.1f} GB/s, {speed / copied:.2f} of a copy"
+        print(f"  {3 * vertices:9,} DOF  {name:34} {told}", flush=True)
+
+
+def time_ccd(report: Report, place: Device, count: int) -> None:
+    """Nanoseconds a query, with transfers."""
+    rng = np.random.default_rng(1)
     for kind in ("vertex_triangle", "edge_edge"):
         for label, family in (("near misses", hard_queries.small_motions), ("random", hard_queries.random)):
             for precision in ("float32", "float64"):
                 points = family(rng, count).astype(precision)
-                seconds = _seconds(
-                    place, lambda p=points, k=kind, w=precision: pdipc.time_of_impact(p, k, precision=w, device=place.name), 5
-                )
-                rows.append(
-                    {
-                        "kind": kind,
-                        "queries": label,
-                        "precision": precision,
-                        "ns a query, with transfers": 1e9 * seconds / count,
-                    }
-                )
-                print(
-                    f"  {kind:16} {label:12} {precision}  {1e9 * seconds / count:8.1f} ns a query, with transfers", flush=True
-                )
-    return rows
+                query = functools.partial(pdipc.time_of_impact, points, kind, precision=precision, device=place.name)
+                ns = 1e9 * _seconds(place, query, 5) / count
+                row = {"kind": kind, "queries": label, "precision": precision, "ns a query, with transfers": ns}
+                report.add(**row)
+                print(f"  {kind:16} {label:12} {precision}  {ns:8.1f} ns a query, with transfers", flush=True)
 
 
-def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, steps: int, seconds: float) -> dict:
+def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, steps: int, seconds: float) -> None:
     """Step times and stages; the witness looks at the last state."""
     simulation = pdipc.Simulation(scene, place.name)
     simulation.step()
@@ -239,8 +266,9 @@ def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, ste
         results.append(simulation.step())
         times.append(1e3 * (time.perf_counter() - start))
     if not results:
-        return {"scene": name, "skipped": "no time left"}
-    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.scripted)
+        report.add(scene=name, skipped="no time left")
+        return
+    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)
     report.check(f"{name}: intersections after {len(results)} steps", len(found), 0)
     stages = {key: statistics.fmean(r.milliseconds[key] for r in results) for key in results[0].milliseconds}
     row = {
@@ -257,31 +285,75 @@ def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, ste
         "barriers": statistics.fmean(r.barriers for r in results),
         "unconverged": sum(not r.converged for r in results),
     }
+    report.add(**row)
     told = " ".join(f"{key} {value:.2f}" for key, value in stages.items())
     print(
         f"  {name:26} {len(results):4} steps  median {row['median ms']:8.2f}  mean {row['mean ms']:8.2f} ms  [{told}]",
         flush=True,
     )
-    return row
 
 
-def time_scenes(report: Report, place: Device, names: list[str], steps: int) -> list[dict]:
+def time_scenes(report: Report, place: Device, names: tuple[str, ...], steps: int) -> None:
     """The scenes of benchmarks/simulation.py."""
     from simulation import SCENES, H
 
-    rows = []
     for name in names:
         scene = pdipc.Scene(simulation={"time_step": H, "steps": steps}, **SCENES[name]())
-        rows.append(time_scene(report, place, scene, name, steps, 25.0))
-    return rows
+        report.attempt(name, functools.partial(time_scene, report, place, scene, name, steps, 25.0))
 
 
-def time_armadillo(report: Report, place: Device, steps: int) -> dict:
+def time_armadillo(report: Report, place: Device, steps: int) -> None:
     """Table 1's row; the paper has 43.1 ms a step and 19.4 to 112 FPS on an RTX 3090."""
     path = _common.data("paper_armadillo/placed.npz")
     if path is None:
-        return {"skipped": "the optional data is not there"}
-    return time_scene(report, place, authors_scene(path), "paper_armadillo", steps, 120.0)
+        report.add(scene="paper_armadillo", skipped="the optional data is not there")
+    else:
+        time_scene(report, place, authors_scene(path), "paper_armadillo", steps, 90.0)
+
+
+BENCHMARK_SCENES = ("block 10^3", "block 20^3", "squeezed block 10^3", "cloth 50x50", "cloth 100x100", "cloth 200x200")
+# Name, the most seconds it may take, and what it does: whole and with --small.
+PARTS: dict[str, tuple[float, Callable[[Report, Device], None], Callable[[Report, Device], None]]] = {
+    "solvers against a direct solution": (100, lambda r, d: check_solvers(r, d, 24), lambda r, d: check_solvers(r, d, 10)),
+    "CCD against the CPU": (60, lambda r, d: check_ccd(r, d, 100_000), lambda r, d: check_ccd(r, d, 200)),
+    "steps against the CPU": (
+        150,
+        lambda r, d: check_steps(r, d, CHECKED_SCENES, STEPS),
+        lambda r, d: check_steps(r, d, CHECKED_SCENES[:1], 2),
+    ),
+    "Table 1, Armadillo": (120, lambda r, d: time_armadillo(r, d, 200), lambda r, d: time_armadillo(r, d, 2)),
+    "benchmark scenes": (
+        180,
+        lambda r, d: time_scenes(r, d, BENCHMARK_SCENES, 100),
+        lambda r, d: time_scenes(r, d, BENCHMARK_SCENES[:1], 3),
+    ),
+    "solvers over sizes (Fig. 8)": (240, lambda r, d: time_solvers(r, d, SIDES), lambda r, d: time_solvers(r, d, (12,))),
+    "CCD": (40, lambda r, d: time_ccd(r, d, 1_000_000), lambda r, d: time_ccd(r, d, 1000)),
+}
+
+
+def run_part(name: str, device: str, small: bool, seconds: float, path: Path) -> int:
+    """One part, in this process."""
+    report = Report(seconds, path)
+    PARTS[name][2 if small else 1](report, Device(device))
+    report._keep()
+    return 0
+
+
+def start_part(name: str, device: str, small: bool, seconds: float, path: Path) -> dict:
+    """One part in a process of its own, which is ended when its time is over; what it found up to its end."""
+    command = [sys.executable, __file__, "--part", name, "--device", device, "--seconds", str(seconds), "-o", str(path)]
+    error = None
+    try:
+        code = subprocess.run([*command, *(["--small"] if small else [])], timeout=seconds + 10).returncode
+        error = f"its process ended with code {code}" if code else None
+    except subprocess.TimeoutExpired:
+        error = f"it did not end within {seconds + 10:.0f} s"
+    found = json.loads(path.read_text()) if path.exists() else {"checks": [], "rows": []}
+    if error:
+        print(f"  BROKEN {name}: {error}", flush=True)
+        found["broken"] = error
+    return found
 
 
 def describe(place: Device) -> dict:
@@ -302,43 +374,42 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", help='absent: the first CUDA device; "cpu" only tries the command')
     parser.add_argument("--small", action="store_true", help="few and small cases, within a minute")
     parser.add_argument("-o", "--output", type=Path, help="absent: benchmarks/results/gpu-<machine>.json")
+    parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some parts: {', '.join(PARTS)}")
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, default=BUDGET, help=f"absent: {BUDGET}")
     options = parser.parse_args(arguments)
     wp.init()
     if options.device is None and not wp.is_cuda_available():
         print("no CUDA device was found; to try this command without one: --device cpu --small", file=sys.stderr)
         return 2
-    place, small = Device(options.device or "cuda:0"), options.small
-    report, machine = Report(BUDGET), describe(place)
-    print(", ".join(str(value) for value in machine.values()))
-    report.part("solvers against a direct solution", 20, lambda: check_solvers(report, place, 10 if small else 24))
-    report.part("CCD against the CPU", 20, lambda: check_ccd(report, place, 200 if small else 100_000))
-    scenes = CHECKED_SCENES[:1] if small else CHECKED_SCENES
-    report.part("steps against the CPU", 60, lambda: check_steps(report, place, scenes, 2 if small else STEPS))
-    report.part("Table 1, Armadillo", 60, lambda: time_armadillo(report, place, 2 if small else 200))
-    names = (
-        ["block 10^3"]
-        if small
-        else ["block 10^3", "block 20^3", "squeezed block 10^3", "cloth 50x50", "cloth 100x100", "cloth 200x200"]
-    )
-    report.part("benchmark scenes", 60, lambda: time_scenes(report, place, names, 3 if small else 100))
-    report.part("solvers over sizes (Fig. 8)", 60, lambda: time_solvers(report, place, (12,) if small else SIDES))
-    report.part("CCD", 10, lambda: time_ccd(place, 1000 if small else 1_000_000))
+    device = options.device or "cuda:0"
+    if options.part:
+        return run_part(options.part, device, options.small, options.seconds, options.output)
+    begun, place = time.perf_counter(), Device(device)
+    machine = describe(place)
+    print(", ".join(str(value) for value in machine.values()), flush=True)
     slug = re.sub(r"[^a-z0-9]+", "-", place.warp.name.lower()).strip("-")
     out = options.output or REPOSITORY / "benchmarks" / "results" / f"gpu-{slug}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    seconds = time.perf_counter() - report.begun
-    found = {
-        "machine": machine,
-        "small": small,
-        "seconds": seconds,
-        "ok": report.ok,
-        "checks": report.checks,
-        "parts": report.parts,
-    }
-    out.write_text(json.dumps(found, indent=1))
-    failed = [check["check"] for check in report.checks if not check["passed"]]
-    print(f"{len(report.checks)} checks, {len(failed)} failed; {seconds:.0f} s; {out}")
-    return 0 if report.ok else 1
+    parts: dict[str, dict] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for number, name in enumerate(options.only or PARTS):
+            left = options.seconds - (time.perf_counter() - begun)
+            print(f"{name}  [{left:.0f} s left]", flush=True)
+            if left < 30:
+                parts[name] = {"checks": [], "rows": [], "skipped": f"{left:.0f} s were left of {options.seconds:.0f}"}
+            else:
+                seconds = min(PARTS[name][0], left - 15)
+                parts[name] = start_part(name, device, options.small, seconds, Path(folder) / f"{number}.json")
+            seconds = time.perf_counter() - begun
+            found = {"machine": machine, "small": options.small, "seconds": seconds, "ok": sound(parts), "parts": parts}
+            out.write_text(json.dumps(found, indent=1))
+    checks = [check for part in parts.values() for check in part["checks"]]
+    failed = sum(not check["passed"] for check in checks)
+    broken = [name for name, part in parts.items() if "broken" in part or any("broken" in row for row in part["rows"])]
+    told = f"; broken: {', '.join(broken)}" if broken else ""
+    print(f"{len(checks)} checks, {failed} failed{told}; {time.perf_counter() - begun:.0f} s; {out}")
+    return 0 if sound(parts) else 1
 
 
 if __name__ == "__main__":

@@ -56,6 +56,7 @@ def describe(name: str, steps: int, substeps: int) -> dict[str, np.ndarray]:
         "v": assembly.velocities,
         "triangles": assembly.triangles,
         "scripted": assembly.scripted,
+        "obstacle": assembly.obstacle,
         "held": held,
         "targets": np.array([assembly.kinematic_positions(t) for t in times]) if model.moves else np.zeros((0, len(held), 3)),
         "activation_distance": np.array(assembly.activation_distance),
@@ -206,7 +207,7 @@ def measure(label: str, name: str, options: argparse.Namespace, folder: Path, sc
         times, frames = out["times"].tolist(), out["frames"].astype(np.float64)
     finite = [bool(np.isfinite(frame).all()) for frame in frames]
     pairs = [
-        len(pdipc.find_intersections(frame, scene["triangles"], scene["scripted"])) if good else -1
+        len(pdipc.find_intersections(frame, scene["triangles"], scene["obstacle"])) if good else -1
         for frame, good in zip(frames, finite, strict=True)
     ]
     return {

@@ -84,7 +84,7 @@ def measure(name: str, steps: int, seconds: float) -> dict:
         start = time.perf_counter()
         results.append(simulation.step())
         times.append(1e3 * (time.perf_counter() - start))
-    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.scripted)
+    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)
     stages = {key: statistics.fmean(r.milliseconds[key] for r in results) for key in results[0].milliseconds}
     return {
         "scene": name,

@@ -1,9 +1,10 @@
 """The CUDA code of everything a step launches compiles, whether or not the machine has a GPU (linear solvers: tests/linear)."""
 
+import numpy as np
 import pytest
 import warp as wp
 
-from pdipc import anderson, energy_rate, parallel
+from pdipc import anderson, energy_rate, forces, parallel
 from pdipc.constraints import projector
 from pdipc.contact import bvh, candidates, pairs, paper, patches, queries, restitution, sweep, truncation
 from pdipc.precision import real
@@ -11,7 +12,9 @@ from pdipc.step import kernels as step_kernels
 
 FACTORIES = {
     "step": step_kernels,
+    "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),
+    "scan": lambda _: parallel.scan_kernels(),
     "anderson": anderson.kernels,
     "energy_rate": energy_rate.kernels,
     "gather": projector.kernels,
@@ -39,3 +42,23 @@ def test_compiles(name, precision, tmp_path):
     for module in modules:
         for binary in wp.compile_aot_module(module, arch=86, module_dir=tmp_path, use_ptx=False):
             assert binary.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("block", [1, 4, 256])
+@pytest.mark.parametrize("count", [1, 3, 255, 256, 257, 70_000])
+def test_scan_in_blocks(count, block):
+    """The sums that CUDA takes by its own kernels, from what each kernel does to a block of threads."""
+    counts = np.random.default_rng(count).integers(0, 100, count).astype(np.int32)
+    ends = wp.array(
+        np.concatenate([np.cumsum(part) for part in np.split(counts, range(block, count, block))]), dtype=wp.int32, device="cpu"
+    )
+    kernels = parallel.scan_kernels()
+    if block == 1:  # the CPU runs blocks of one thread
+        ends.zero_()
+        wp.launch(kernels["scan_blocks"], count, [count, wp.array(counts, device="cpu"), ends], device="cpu")
+        wp.launch(kernels["scan_ends"], 1, [count, ends], device="cpu")
+    else:
+        host = ends.numpy()
+        host[block - 1 :: block] = np.cumsum(host[block - 1 :: block])
+    wp.launch(kernels["add_ends"], count, [block, ends], device="cpu")
+    assert np.array_equal(ends.numpy(), np.cumsum(counts))

@@ -1,7 +1,13 @@
 """External forces f_ext of Eq. (1), as accelerations: gravity, wind on surfaces, forces on vertices."""
 
-import numpy as np
+import functools
+from types import SimpleNamespace
 
+import numpy as np
+import warp as wp
+
+from pdipc.parallel import Device
+from pdipc.precision import Real
 from pdipc.scene.assembly import AssembledForce, AssembledWind, Assembly
 
 
@@ -43,19 +49,125 @@ class ExternalForces:
         self.gravity = np.tile(np.asarray(gravity, dtype=np.float64), (len(mass), 1))
         self.pulled: tuple[np.ndarray, np.ndarray] = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
-    @property
-    def constant(self) -> bool:
-        """Whether only gravity acts, now and later."""
-        return not (self.assembly.winds or self.assembly.forces or len(self.pulled[0]))
+    def acting(self, time: float) -> list[int]:
+        """Which of the forces on vertices act at `time`."""
+        return [k for k, force in enumerate(self.assembly.forces) if force.start <= time < force.end]
+
+    def steady(self, time: float) -> np.ndarray:
+        """(n, 3) m/s^2 without wind: what does not depend on where the vertices are."""
+        force = np.zeros_like(self.gravity)
+        for each in self.assembly.forces:
+            force += vertex_force(each, len(force), time)
+        vertices, pull = self.pulled
+        np.add.at(force, vertices, pull)
+        return self.gravity + self._over_mass(force)
 
     def accelerations(self, time: float, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         """(n, 3) m/s^2 at the given state, time in s."""
         force = np.zeros_like(self.gravity)
         for wind in self.assembly.winds:
             force += wind_force(wind, positions, velocities, time)
-        for each in self.assembly.forces:
-            force += vertex_force(each, len(force), time)
-        vertices, pull = self.pulled
-        np.add.at(force, vertices, pull)
-        mass = np.where(self.mass > 0.0, self.mass, np.inf)
-        return self.gravity + force / mass[:, None]
+        return self.steady(time) + self._over_mass(force)
+
+    def _over_mass(self, force: np.ndarray) -> np.ndarray:
+        return force / np.where(self.mass > 0.0, self.mass, np.inf)[:, None]
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    """`wind_force`, gathered by vertex so that sums keep their order."""
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def drag(
+        first: int,
+        time: wp.float64,
+        triangles: wp.array(dtype=wp.vec3i),
+        windows: wp.array(dtype=wp.vec2d),
+        air: wp.array(dtype=vec3),
+        factor: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        third_out: wp.array(dtype=vec3),
+    ):
+        """A third of the drag on each triangle: factor |u.n| (u.n) (double area) n."""
+        t = first + wp.tid()
+        third = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        if windows[t][0] <= time and time < windows[t][1]:
+            q = triangles[t]
+            normal = wp.cross(x[q[1]] - x[q[0]], x[q[2]] - x[q[0]])
+            double_area = wp.length(normal)
+            if double_area > scalar(0.0):
+                normal = normal / double_area
+                past = air[t] - (v[q[0]] + v[q[1]] + v[q[2]]) / scalar(3.0)
+                across = wp.dot(past, normal)
+                third = factor[t] * wp.abs(across) * across * double_area * normal
+        third_out[t] = third
+
+    @wp.kernel(module=module)
+    def gather(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        third: wp.array(dtype=vec3),
+        inverse_mass: wp.array(dtype=scalar),
+        steady: wp.array(dtype=vec3),
+        acceleration_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        force = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        for k in range(starts[i], starts[i + 1]):
+            force += third[members[k]]
+        acceleration_out[i] = steady[i] + inverse_mass[i] * force
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+
+
+class Loads:
+    """External accelerations on the device: wind is computed there, the rest uploaded when a force begins, ends or is replaced.
+
+    acceleration: (n,) vec3, m/s^2, after `update`.
+    """
+
+    def __init__(self, device: Device, real: Real, external: ExternalForces):
+        self.device, self.real, self.external, self._kernels = device, real, external, kernels(real)
+        n, winds = len(external.mass), external.assembly.winds
+        self.acceleration = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self._uploaded: tuple[list[int], tuple] | None = None
+        self._count = sum(len(wind.triangles) for wind in winds)
+        self._steady = self.acceleration
+        if not self._count:
+            return
+
+        def upload(values: np.ndarray, dtype) -> wp.array:
+            return wp.array(values, dtype=dtype, device=device.warp)
+
+        sizes = [len(wind.triangles) for wind in winds]
+        triangles = np.concatenate([wind.triangles for wind in winds]).astype(np.int32)
+        windows = np.repeat([[wind.start, wind.end] for wind in winds], sizes, axis=0)
+        air = np.repeat([wind.velocity for wind in winds], sizes, axis=0)
+        factor = np.repeat([0.25 * wind.air_density * wind.drag / 3.0 for wind in winds], sizes)
+        corner = triangles.ravel()
+        order = np.argsort(corner, kind="stable")
+        starts = np.searchsorted(corner[order], np.arange(n + 1))
+        inverse_mass = np.where(external.mass > 0.0, 1.0 / np.where(external.mass > 0.0, external.mass, 1.0), 0.0)
+        self._steady = wp.zeros_like(self.acceleration)
+        self._third = wp.zeros(self._count, dtype=real.vec3, device=device.warp)
+        self._triangles = [upload(triangles, wp.vec3i), upload(windows, wp.vec2d), upload(air.astype(real.numpy), real.vec3)]
+        self._triangles.append(upload(factor.astype(real.numpy), real.scalar))
+        self._incident = [upload(starts.astype(np.int32), wp.int32), upload((order // 3).astype(np.int32), wp.int32)]
+        self._inverse_mass = upload(inverse_mass.astype(real.numpy), real.scalar)
+
+    def update(self, time: float, x: wp.array, v: wp.array) -> None:
+        """Launches the accelerations at positions x and velocities v, (n,) vec3, at `time`, s."""
+        external = self.external
+        acting = external.acting(time)
+        if self._uploaded is None or self._uploaded[0] != acting or self._uploaded[1] is not external.pulled:
+            self._steady.assign(external.steady(time).astype(self.real.numpy))
+            self._uploaded = acting, external.pulled
+        if self._count:
+            inputs = [wp.float64(time), *self._triangles, x, v, self._third]
+            self.device.launch(self._kernels.drag, self._count, inputs, grain=16)
+            inputs = [*self._incident, self._third, self._inverse_mass, self._steady, self.acceleration]
+            self.device.launch(self._kernels.gather, len(x), inputs, grain=8)

@@ -36,8 +36,9 @@ from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
-DEFAULT_SOLVER = {"barrier": "two-level", "paper": "a-jacobi"}
-UNFIT = {"barrier": ("a-jacobi", "direct"), "paper": ("direct",)}  # solvers without 3x3 contacts, and one that the host drives
+# The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
+DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": {"barrier": "pcg", "paper": "a-jacobi"}}
+UNFIT = {"barrier": ("a-jacobi",), "paper": ()}  # A-products cannot take 3x3 contacts
 INNER_TOLERANCE = 0.2
 
 
@@ -186,13 +187,19 @@ def build(scene: Scene, device: str | None = None) -> Model:
     method, truncation = scene.contact.method, scene.contact.truncation
     if truncation == "auto":
         truncation = "global" if method == "paper" else "per_vertex"
-    name = DEFAULT_SOLVER[method] if sim.linear_solver == "auto" else sim.linear_solver
+    name = DEFAULT_SOLVER["cuda" if place.is_cuda else "cpu"][method] if sim.linear_solver == "auto" else sim.linear_solver
     if name in UNFIT[method]:
         raise SceneError(
-            f'simulation.linear_solver is "{name}", which cannot take the contacts of a recorded step with contact.method '
+            f'simulation.linear_solver is "{name}", which cannot take the contacts of contact.method '
             f'"{method}"; it must be one of: {", ".join(other for other in SOLVERS if other not in UNFIT[method])}'
         )
+    if sim.solver_drop > 0.0 and name != "a-jacobi":
+        raise SceneError(
+            f'simulation.solver_drop is {sim.solver_drop:g}, but only a-jacobi has A-products; the solver is "{name}"'
+        )
     options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
+    if name == "a-jacobi":
+        options["drop"] = sim.solver_drop
     system = System(place, number, matrix, free)
     solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
 
@@ -217,7 +224,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
     def upload(values: np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
 
-    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, ~free)
+    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle)
     return Model(
         scene=scene,
         assembly=assembly,

@@ -25,6 +25,7 @@ import warp as wp
 
 from pdipc.precision import Real
 
+SCAN_BLOCK = 256  # numbers that a block of CUDA threads scans together
 REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads
 CPU_BLOCK = 64  # list entries that one CPU thread takes at a time
 CUDA_BLOCK = 1
@@ -117,6 +118,11 @@ class Device:
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
         self._meeting = None if self.is_cuda else wp.zeros(32, dtype=wp.int32, device=self.warp)
 
+    @functools.cached_property
+    def records_loops(self) -> bool:
+        """Whether a recorded graph may hold loops and conditions: on CUDA from toolkit and driver 12.4 on."""
+        return not self.is_cuda or wp.is_conditional_graph_supported()
+
     def __deepcopy__(self, memo: dict) -> "Device":
         return self
 
@@ -208,8 +214,24 @@ class Device:
             self._meet()
 
     def scan(self, counts: wp.array, ends_out: wp.array) -> None:
-        """ends_out[i] = counts[0] + ... + counts[i]."""
-        self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
+        """ends_out[i] = counts[0] + ... + counts[i], int32.
+
+        On CUDA by kernels of our own: Warp's scan allocates memory, which CUDA refuses inside the loops of a graph.
+        """
+        if self.is_cuda:
+            n = counts.size
+            k = scan_kernels()
+            wp.launch(
+                k["scan_blocks"],
+                -(-n // SCAN_BLOCK) * SCAN_BLOCK,
+                [n, counts, ends_out],
+                device=self.warp,
+                block_dim=SCAN_BLOCK,
+            )
+            wp.launch(k["scan_ends"], SCAN_BLOCK, [n, ends_out], device=self.warp, block_dim=SCAN_BLOCK)
+            wp.launch(k["add_ends"], n, [SCAN_BLOCK, ends_out], device=self.warp)
+        else:
+            self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
 
     def loop(self, condition: wp.array, body: Callable[[], None]) -> None:
         """Repeats `body` while the one int32 in `condition` is not zero; the body must launch before it changes that."""
@@ -246,6 +268,51 @@ def _span(first: int, step: int, block: int) -> Any:
     span = Span()
     span.first, span.step, span.block = first, step, block
     return span
+
+
+@functools.cache
+def scan_kernels() -> dict[str, wp.Kernel]:
+    """Inclusive sums in place of an array: within blocks, over the ends of blocks, then ends are added to the blocks after them.
+
+    The last number of each block is final after the second kernel, so no other memory is needed.
+    """
+    module = wp.get_module(f"{__name__}.scan")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module)
+    def scan_blocks(count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        value = int(0)
+        if i < count:
+            value = counts[i]
+        total = wp.untile(wp.tile_scan_inclusive(wp.tile(value)))
+        if i < count:
+            ends_out[i] = total
+
+    @wp.kernel(module=module)
+    def scan_ends(count: int, ends: wp.array(dtype=wp.int32)):
+        """Runs in one block of threads."""
+        lane = wp.tid()
+        size = wp.block_dim()
+        before = int(0)
+        for begin in range(0, count, size * size):
+            last = begin + (lane + 1) * size - 1
+            value = int(0)
+            if last < count:
+                value = ends[last]
+            values = wp.tile(value)
+            total = before + wp.untile(wp.tile_scan_inclusive(values))
+            if last < count:
+                ends[last] = total
+            before += wp.tile_extract(wp.tile_sum(values), 0)
+
+    @wp.kernel(module=module)
+    def add_ends(size: int, ends: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        if i >= size and i % size != size - 1:
+            ends[i] = ends[i] + ends[i // size * size - 1]
+
+    return {"scan_blocks": scan_blocks, "scan_ends": scan_ends, "add_ends": add_ends}  # pyright: ignore[reportReturnType]
 
 
 @functools.cache

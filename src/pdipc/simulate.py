@@ -38,6 +38,7 @@ class Simulation:
     """A scene in motion: a model, its state and its buffers.
 
     device: "cpu", "cuda:0", or None for the scene's choice. observe(x, x_end): see `pdipc.step.step`.
+    state: the current one, whose arrays every step overwrites (`copy.deepcopy` keeps it).
     """
 
     def __init__(self, scene: Scene | Model, device: str | None = None, observe: Callable | None = None):
@@ -69,8 +70,7 @@ class Simulation:
         """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them."""
         results = []
         for _ in range(self.model.substeps):
-            result = step(self.model, self.state, self.work, self.observe)
-            self.state = result.state
+            result = step(self.model, self.state, self.work, self.observe, into=self.state)
             results.append(result)
         return _merge(results)
 
@@ -143,6 +143,7 @@ def run_scene(
     else:
         topology = {"triangles": model.triangles, **model.assembly.topology()}
         meta = {"device": model.device.name, "precision": model.real.name, "threads": model.device.threads}
+        meta |= {"solver_dropped": model.solver.dropped}
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
         writer.append(0, 0.0, simulation.positions, {})
         writer.checkpoint(0, simulation.state.arrays())

@@ -1,6 +1,7 @@
 """One time step: Algorithm 1 of the paper, corrected (docs/paper_map.md)."""
 
 import functools
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from pdipc.contact.paper import OUTER_SQUARED, PaperPairs
 from pdipc.contact.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.contact.truncation import Truncation
 from pdipc.energy_rate import EnergyRate
+from pdipc.forces import Loads
 from pdipc.model import Model, State
 from pdipc.parallel import Graph, Reducer
 from pdipc.precision import Real
@@ -27,6 +29,8 @@ STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places
 RUNNING, CONVERGED, CAPPED, OUT_OF_TIME, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(6))
 STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND = (wp.constant(place) for place in range(5))
 COUNTS = 5
+# What a step reports after its counts, in one array that the host reads once: iterations, residual, gap, then the stages' times.
+LOCAL_GLOBAL, LINEAR, RESIDUAL, GAP, TIMES = (wp.constant(place) for place in range(COUNTS, COUNTS + 5))
 
 # The step is one graph, so its stages are timed where it runs.
 _CLOCK = """
@@ -114,9 +118,17 @@ def kernels(real: Real) -> SimpleNamespace:
         increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
     @wp.kernel(module=module)
-    def begin(first: int, count: wp.array(dtype=wp.int32), going_out: wp.array(dtype=wp.int32)):
+    def begin(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        local_global: wp.array(dtype=wp.int32),
+        linear: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
         for i in range(count.shape[0]):
             count[i] = 0
+        local_global[0] = 0
+        linear[0] = 0
         going_out[0] = 1
 
     @wp.kernel(module=module)
@@ -227,6 +239,28 @@ def kernels(real: Real) -> SimpleNamespace:
         a_out[i] = (velocity - v[i]) / h
         v_out[i] = velocity
 
+    @wp.kernel(module=module)
+    def report(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        local_global: wp.array(dtype=wp.int32),
+        linear: wp.array(dtype=wp.int32),
+        residual: wp.array(dtype=scalar),
+        closest: wp.array(dtype=scalar),
+        clock: wp.array(dtype=wp.float64),
+        report_out: wp.array(dtype=wp.float64),
+    ):
+        for i in range(count.shape[0]):
+            report_out[i] = wp.float64(count[i])
+        report_out[LOCAL_GLOBAL] = wp.float64(local_global[0])
+        report_out[LINEAR] = wp.float64(linear[0])
+        report_out[RESIDUAL] = wp.float64(residual[0])
+        report_out[GAP] = wp.float64(wp.inf)
+        if count[BARRIERS] > 0:
+            report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))
+        for stage in range(STARTED):
+            report_out[TIMES + stage] = clock[stage]
+
     @wp.func_native(_CLOCK)
     def milliseconds() -> wp.float64: ...
 
@@ -251,13 +285,17 @@ def kernels(real: Real) -> SimpleNamespace:
 class Work:
     """Buffers of a step, allocated once for a model, and the recorded step.
 
-    recorded: whether steps run as recorded graphs; without, each kernel is launched from Python, with the same bits.
+    recorded: whether steps run as recorded graphs; without, each kernel is launched from Python, with the same bits. So it
+    is for a solver that the host drives, and, with a warning, on a CUDA driver that has no loops in graphs.
     """
 
     def __init__(self, model: Model, recorded: bool = True):
         device, real, n = model.device, model.real, model.vertex_count
         vec3, scalar = real.vec3, real.scalar
-        self.model, self.recorded, self.kernels = model, recorded, kernels(real)
+        self.model, self.kernels = model, kernels(real)
+        self.recorded = recorded and model.solver.recordable and device.records_loops
+        if recorded and not device.records_loops:
+            warnings.warn(f"the driver of {device.name} has no loops in graphs: each kernel is launched alone", stacklevel=2)
 
         def zeros(dtype, count=n):
             return wp.zeros(count, dtype=dtype, device=device.warp)
@@ -265,11 +303,13 @@ class Work:
         self.x_start, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3)
         self.x, self.v, self.a = zeros(vec3), zeros(vec3), zeros(vec3)
         self.x_tilde, self.z = zeros(vec3), zeros(vec3)
-        self.target, self.acceleration = zeros(vec3), zeros(vec3)
+        self.target, self.loads = zeros(vec3), Loads(device, real, model.external)
+        self.acceleration = self.loads.acceleration
         self.force, self.rhs, self.increment = zeros(vec3), zeros(vec3), zeros(vec3)
         self.moved, self.residual, self.committed = zeros(scalar), zeros(scalar, 1), zeros(scalar, 1)
         self.count, self.going = zeros(wp.int32, COUNTS), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(STAGES) + 2)
+        self.report = zeros(wp.float64, TIMES + len(STAGES))
         self.largest = Reducer(device, real, n)
         settings = model.settings
         self.candidates = Candidates(
@@ -298,19 +338,16 @@ class Work:
         self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
         self._graphs: dict[str, Graph] = {}
         self._graphs_of: tuple[int, int] = (-1, -1)
-        self._scripted = self._steady = False  # whether `target` is uploaded, and `acceleration` holds what stays
+        self._scripted = False
 
     def set_scripted(self, state: State, time: float) -> None:
-        """Where kinematic vertices go by `time`, and the external accelerations; only uploaded where they change."""
+        """Where kinematic vertices go by `time`, only uploaded where they move, and the external accelerations."""
         model = self.model
         if not self._scripted or model.moves:
             self.target.assign(model.kinematic_targets(time))
             model.move_anchors(time)
+        self.loads.update(state.time, state.positions, state.velocities)
         self._scripted = True
-        if not (self._steady and model.external.constant):
-            positions, velocities = state.positions.numpy(), state.velocities.numpy()
-            self.acceleration.assign(model.external.accelerations(state.time, positions, velocities))
-            self._steady = model.external.constant
 
     def run(self, part: Callable[[], None]) -> None:
         """Replays `part` of a step; records it first where it is new or arrays were replaced."""
@@ -351,7 +388,7 @@ class Work:
         """Lines 1 to 3."""
         model, device, k, n = self.model, self.model.device, self.kernels, self.model.vertex_count
         device.launch_serial(k.start_clock, [self.clock])
-        device.launch_serial(k.begin, [self.count, self.going])
+        device.launch_serial(k.begin, [self.count, self.inner.done, model.solver.iterations, self.going])
         device.copy(self.x, self.x_start)
         start = [self.x_start, self.v_start, self.a_start, self.acceleration, self.target, model.free]
         device.launch(k.predict, n, [*start, model.real.scalar(model.settings.time_step), self.z, self.x_tilde])
@@ -413,10 +450,12 @@ class Work:
         inputs = [self.x_start, moved_to, h, self.v_start, self.a_start, self.v, self.a]
         model.device.launch(k.finish, model.vertex_count, inputs)
         self._mark("misc")
+        numbers = [self.count, self.inner.done, model.solver.iterations, self.residual, self.pairs.closest, self.clock]
+        model.device.launch_serial(k.report, [*numbers, self.report])
 
     def _rebound(self) -> None:
         model, rebound = self.model, self.restitution
-        assert rebound is not None  # `finish` asks
+        assert rebound is not None  # only then is this part of the step
         model.projector.add_forces(self.x, rebound.elastic, rebound.zero)
         self.parting.begin(REBOUND_ITERATIONS)
 
@@ -439,11 +478,15 @@ class Work:
         self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), self.clock])
 
 
-def step(model: Model, state: State, work: Work | None = None, observe=None) -> StepResult:
-    """One time step of h from `state`, which is left as it is: Algorithm 1.
+def step(
+    model: Model, state: State, work: Work | None = None, observe: Callable | None = None, into: State | None = None
+) -> StepResult:
+    """One time step of h from `state`: Algorithm 1. The host waits for the device once, to read the report at the end.
 
     work: buffers from an earlier step of this model; made where None. observe(x, x_end): called with the start and the end of
     every outer iteration's committed motion, (n,) vec3 on the device, for witnesses and certificates.
+    into: whose arrays receive the new state, so that nothing is allocated; it may be `state`. Where None the new state gets
+    arrays of its own, and `state` stays as it is.
     """
     work = work or Work(model)
     work.set_scripted(state, state.time + model.settings.time_step)
@@ -453,8 +496,6 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
         wp.copy(work.x_start, state.positions)
         wp.copy(work.v_start, state.velocities)
         wp.copy(work.a_start, state.accelerations)
-        for counter in (work.inner.done, model.solver.iterations):
-            counter.zero_()
         motions = []
         if observe is None:
             work.run(work.whole_step)
@@ -465,33 +506,38 @@ def step(model: Model, state: State, work: Work | None = None, observe=None) -> 
                 work.run(work.outer_iteration)
                 motions.append((begin, wp.clone(work.x)))
             work.run(work.finish)
-        count = work.count.numpy()
-        if count[STATUS] != OVERFLOW:
+        report = work.report.numpy().tolist()
+        if report[STATUS] != OVERFLOW:
             break
         if not work.grow():  # a list was full: with more room, the step is taken again
             raise AssertionError("a list overflowed that had room")
     if observe is not None:
         for motion in motions:
             observe(*motion)
-    s, status = model.settings, count[STATUS]
+    s, status, outer = model.settings, int(report[STATUS]), int(report[OUTER])
     message = {
         CONVERGED: "",
         CAPPED: f"the cap of {s.max_outer} outer iterations ended the step",
-        OUT_OF_TIME: f"the time budget of {s.budget_ms or 0.0:g} ms ended the step after {count[OUTER]} outer iterations",
+        OUT_OF_TIME: f"the time budget of {s.budget_ms or 0.0:g} ms ended the step after {outer} outer iterations",
         NOT_FINITE: "the iterate is not finite; the step kept the last feasible state",
     }[status]
-    new = State(wp.clone(work.x), wp.clone(work.v), wp.clone(work.a), state.time + s.time_step, state.step + 1)
+    time, number = state.time + s.time_step, state.step + 1
+    new = into or State(*(wp.empty_like(each) for each in (work.x, work.v, work.a)))
+    wp.copy(new.positions, work.x)
+    wp.copy(new.velocities, work.v)
+    wp.copy(new.accelerations, work.a)
+    new.time, new.step = time, number
     return StepResult(
         state=new,
-        converged=bool(status == CONVERGED),
+        converged=status == CONVERGED,
         message=message,
         constraints=model.projector.count,
-        barriers=int(count[BARRIERS]),
-        local_global=int(work.inner.done.numpy()[0]),
-        outer=int(count[OUTER]),
-        linear_iterations=int(model.solver.iterations.numpy()[0]),
-        truncations=int(count[TRUNCATIONS]),
-        residual=float(work.residual.numpy()[0]),
-        smallest_gap=-float(work.pairs.closest.numpy().max()) if count[BARRIERS] else float("inf"),
-        milliseconds=dict(zip(STAGES, work.clock.numpy().tolist(), strict=False)),
+        barriers=int(report[BARRIERS]),
+        local_global=int(report[LOCAL_GLOBAL]),
+        outer=outer,
+        linear_iterations=int(report[LINEAR]),
+        truncations=int(report[TRUNCATIONS]),
+        residual=report[RESIDUAL],
+        smallest_gap=report[GAP],
+        milliseconds=dict(zip(STAGES, report[TIMES:], strict=True)),
     )

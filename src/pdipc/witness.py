@@ -17,11 +17,11 @@ UNDERFLOW = 1e-290  # far above what products lose by underflow
 CHUNK = 1 << 17  # pairs that are tested at a time
 
 
-def find_intersections(positions: np.ndarray, triangles: np.ndarray, scripted: np.ndarray | None = None) -> np.ndarray:
+def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: np.ndarray | None = None) -> np.ndarray:
     """All pairs of triangles that have a point in common which is no part of a vertex or edge that they share.
 
-    positions: (n, 3). triangles: (m, 3) indices. scripted: (n,) bool, vertices whose motion is prescribed; triangles that have
-    only such vertices may meet each other, since no simulation could keep them apart, and such pairs are left out.
+    positions: (n, 3). triangles: (m, 3) indices. obstacle: (n,) bool, vertices of obstacles; triangles of obstacles may meet
+    each other, as a post stands in a floor, and such pairs are left out.
 
     Returns (k, 2) int64, i < j in each row, rows ascending; touching counts.
     Triangles that share one vertex are tested away from it; triangles that share an edge meet beyond it only when they lie
@@ -48,8 +48,8 @@ def find_intersections(positions: np.ndarray, triangles: np.ndarray, scripted: n
     places = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts) + first[crossings[rows, 0]]
     pairs = np.column_stack([owner[places], crossings[rows, 1]])
     pairs = np.concatenate([pairs, _folded(positions, triangles, edges, owner, first)])
-    if scripted is not None:
-        pairs = pairs[~np.asarray(scripted)[triangles[pairs]].all(axis=(1, 2))]
+    if obstacle is not None:
+        pairs = pairs[~np.asarray(obstacle)[triangles[pairs]].all(axis=(1, 2))]
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 

@@ -146,13 +146,33 @@ def test_published_frames(name, method):
     # the source numbers vertices, then edges by their later and then their earlier end, then faces
     edges = surface.unique_edges(faces)
     edges = edges[np.lexsort((edges[:, 0], edges[:, 1]))]
-    pairs = frame["pair_ee"][frame["hit_ee"]] - n
-    quads = np.sort(edges[pairs].reshape(-1, 2, 2), axis=2)
-    apart = np.array([len(set(q.ravel())) == 4 for q in quads], dtype=bool)
-    found = {frozenset((tuple(a), tuple(b))) for a, b in skin.members[1][edge_edge].tolist()}
-    assert all(frozenset(map(tuple, q)) in found for q in quads[apart].tolist())
-    pairs = frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]
-    found = {(v, frozenset(skin.members[2][t].tolist())) for v, t in vertex_triangle.tolist()}
-    expected = [(int(v), frozenset(faces[t].tolist())) for v, t in pairs.tolist() if v not in faces[t]]
-    assert len(expected) + apart.sum() > 50
-    assert all(pair in found for pair in expected)
+    vertices, own_edges, own_faces = skin.members
+    i, j = (places(edges[own - n], own_edges) for own in frame["pair_ee"][frame["hit_ee"]].T)
+    apart = (own_edges[i][:, :, None] != own_edges[j][:, None, :]).all(axis=(1, 2))
+    all_listed(np.minimum(i, j)[apart], np.maximum(i, j)[apart], *edge_edge.T)
+    v, t = (frame["pair_vf"][frame["hit_vf"]] - [0, n + len(edges)]).T
+    apart_too = (faces[t] != v[:, None]).all(axis=1)
+    v, t = places(v[apart_too, None], vertices), places(faces[t[apart_too]], own_faces)
+    position = np.zeros(n, dtype=int)
+    position[vertices[:, 0]] = np.arange(len(vertices))
+    all_listed(v, t, position[vertex_triangle[:, 0]], vertex_triangle[:, 1])
+    assert len(v) + apart.sum() > 50
+
+
+def places(rows, table):
+    """(k,) where each row of vertices is in a table that holds it."""
+
+    def keys(a):
+        return np.ravel_multi_index(tuple(a.T.astype(np.int64)), (table.max() + 1,) * table.shape[1])
+
+    order = np.argsort(keys(table))
+    found = order[np.searchsorted(keys(table)[order], keys(rows))]
+    assert np.array_equal(table[found], rows)
+    return found
+
+
+def all_listed(first, second, listed_first, listed_second):
+    """Every pair is in the list, which ascends by its first, then its second."""
+    wanted, listed = (a.astype(np.int64) << 31 | b for a, b in ((first, second), (listed_first, listed_second)))
+    assert np.all(np.diff(listed) > 0)
+    assert np.array_equal(listed[np.minimum(np.searchsorted(listed, wanted), len(listed) - 1)], wanted)

@@ -8,9 +8,12 @@ from linear import systems
 from linear.contacts import CoupledContact
 from linear.test_solvers import MESHES, case, error, solve
 from pdipc.linear import System, make_solver
-from pdipc.linear.aggregated import aggregate
+from pdipc.linear.aggregated import AJacobi, aggregate
+from pdipc.model import build
 from pdipc.parallel import Device
 from pdipc.precision import real
+from pdipc.scene.errors import SceneError
+from pdipc.step import Work, step
 
 DEVICE, PRECISION = Device("cpu", threads=1), real("float64")
 
@@ -166,3 +169,36 @@ def test_refusals():
         make_solver("matrix-powers", system, order=0)
     with pytest.raises(ValueError, match="diverge"):
         make_solver("chebyshev", case("jittered Delaunay", "none", 0.0, DEVICE, PRECISION)[0], weight=1.0)
+
+
+def test_drop_in_a_scene():
+    """The option reaches the solver, what it left out is reported, and other solvers refuse it."""
+    from physics.scenes import cloth, scene
+
+    def built(**simulation):
+        return build(scene([cloth("sheet", [0.4, 0.4], [7, 7])], contact={"method": "paper"}, **simulation), "cpu").solver
+
+    whole, thinned = built(), built(solver_drop=1e-2)
+    assert whole.dropped == 0.0
+    assert 0.0 < thinned.dropped < 0.2
+    assert thinned.products.paths < whole.products.paths
+    with pytest.raises(SceneError, match=r'only a-jacobi has A-products; the solver is "pcg"'):
+        built(solver_drop=1e-2, linear_solver="pcg")
+
+
+def test_coefficients_are_made_once_in_an_outer_iteration(monkeypatch):
+    """The diagonal changes with the barriers only: all local-global iterations between share the A-coefficients (Appendix A)."""
+    from physics.scenes import floor, scene, solid
+
+    body = solid("block", (0.2, 0.2, 0.2), (2, 2, 2), at=(0, 0.125, 0), rotation=(5, 0, 8), velocity=(0, -2, 0))
+    contact = {"method": "paper", "activation_distance": 2e-3, "minimum_separation": 1e-4}
+    model = build(scene([body], [floor()], contact=contact), "cpu")
+    prepared, prepare = [], AJacobi.prepare
+    monkeypatch.setattr(AJacobi, "prepare", lambda self, of: prepared.append(of) or prepare(self, of))
+    work, state, outer, inner, barriers = Work(model, recorded=False), model.initial_state(), 0, 0, 0
+    for _ in range(8):
+        result = step(model, state, work)
+        state, outer, inner = result.state, outer + result.outer, inner + result.local_global
+        barriers = max(barriers, result.barriers)
+    assert barriers > 0
+    assert len(prepared) == outer < inner

@@ -12,7 +12,7 @@ FACTORIES = {
     "two-level": coarse.kernels,
     "jacobi": jacobi.kernels,
     "a-jacobi": aggregated.kernels,
-    "a-jacobi in groups": lambda precision: aggregated.group_kernels(precision, 700),
+    "a-jacobi in groups": lambda precision: aggregated.group_kernels(precision, aggregated.capacity_on_cuda(precision)),
     "matrix powers": lambda precision: powers.group_kernels(precision, powers.capacity_on_cuda(precision)),
     "gauss-seidel": gauss_seidel.kernels,
 }

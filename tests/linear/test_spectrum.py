@@ -8,8 +8,8 @@ import scipy.sparse.linalg as spla
 
 from linear import systems
 from linear.contacts import CoupledContact
-from linear.test_solvers import MESHES, meshes
-from pdipc.linear import System
+from linear.test_solvers import MESHES, meshes, solve
+from pdipc.linear import System, make_solver, spectrum
 from pdipc.linear.spectrum import MARGIN
 from pdipc.parallel import Device
 from pdipc.precision import real
@@ -69,3 +69,21 @@ def test_contacts_do_not_leave_the_interval():
 def test_nothing_free():
     x, matrix = meshes()["soft cloth"]
     assert System(DEVICE, real("float64"), matrix, np.zeros(len(x), dtype=bool)).interval == (1.0, 1.0)
+
+
+def test_computed_once_for_a_mesh(monkeypatch):
+    """All solvers of a system share the interval, and contacts do not make it anew."""
+    x, matrix = meshes()["soft cloth"]
+    free = np.ones(len(x), dtype=bool)
+    system, measured = System(DEVICE, real("float64"), matrix, free), []
+    measure = spectrum.interval
+    monkeypatch.setattr(spectrum, "interval", lambda of: measured.append(of) or measure(of))
+    b = np.random.default_rng(0).standard_normal((len(x), 3))
+    for name in ("chebyshev", "jacobi", "sor", "matrix-powers"):
+        solver = make_solver(name, system, max_iterations=8)
+        for stiffness in (1.0, 1e4):
+            contact = CoupledContact(DEVICE, real("float64"), len(x), free, 5, stiffness * matrix.diagonal().mean())
+            solve(solver, 0.0 * b, b, contact)
+    assert measured == [system]
+    System(DEVICE, real("float64"), 2.0 * matrix, free).interval  # noqa: B018
+    assert len(measured) == 2

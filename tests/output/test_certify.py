@@ -43,9 +43,24 @@ def test_coming_very_close_is_no_hit_and_is_measured(tmp_path):
     assert certificate.smallest_gap == pytest.approx(float(height) - float(ball), rel=1e-6)
 
 
+def test_nearer_than_the_first_judge_can_tell_is_decided_exactly(tmp_path):
+    """A slanted cloth that comes 1e-12 m near the ball is no hit though Tight Inclusion accuses it; 1e-12 m too far is one."""
+    slope = np.array([0.2, 0.1])
+    for name, gap in (("near", 1e-12), ("too far", -1e-12)):
+        writer, start = runs.begin(tmp_path / name)
+        end = start.astype(np.float64)
+        cloth, ball = end[:, 1] > 0.58, end[: np.flatnonzero(end[:, 1] > 0.58)[0]]
+        end[cloth, 1] = (ball[:, 1] + ball[:, [0, 2]] @ slope).max() + gap - end[cloth][:, [0, 2]] @ slope
+        writer.append_segments(1, 0, start, end)
+        writer.append(1, 0.01, end, {})
+        certificate = certify(open_run(tmp_path / name))
+        assert bool(certificate.hits) == (gap < 0)
+        assert gap < 0 or certificate.close > 0
+
+
 def test_obstacles_may_meet_each_other(tmp_path):
     run = cloth_moved(tmp_path / "run", 0.02)
-    run.scripted[:] = True
+    run.obstacle[:] = True
     certificate = certify(run)
     assert (certificate.pairs, certificate.hits) == (0, [])
 

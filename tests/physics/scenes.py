@@ -35,10 +35,10 @@ class Witness:
 
     def __init__(self, simulation):
         self.triangles, self.checked = simulation.triangles, 0
-        self.scripted = simulation.model.assembly.scripted
+        self.obstacle = simulation.model.assembly.obstacle
 
     def __call__(self, x, x_end):
-        found = pdipc.find_intersections(np.asarray(x_end.numpy(), dtype=np.float64), self.triangles, self.scripted)
+        found = pdipc.find_intersections(np.asarray(x_end.numpy(), dtype=np.float64), self.triangles, self.obstacle)
         assert len(found) == 0, f"triangles {found[:3].tolist()} intersect"
         self.checked += 1
 

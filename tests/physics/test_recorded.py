@@ -4,9 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
+import warp as wp
 
 import pdipc
-from pdipc.step import Work
+import pdipc.parallel
+from pdipc.step import Work, step
 from physics.scenes import cloth, floor, scene, solid
 
 
@@ -46,3 +48,61 @@ def test_watching_changes_nothing():
     assert len(motions) == sum(count[0] for count in counts)
     for (_, end), (start, _) in itertools.pairwise(motions):
         assert np.array_equal(end, start)
+
+
+def test_a_step_allocates_nothing_and_is_read_once(monkeypatch):
+    """Once the lists are long enough: no memory on the device, and one small array that the host waits for."""
+    simulation = pdipc.Simulation(falling_cloth("float64"), "cpu")
+    for _ in range(8):
+        simulation.step()
+    device, read, allocated = wp.get_device("cpu"), [], []
+    allocate, numpy = device.default_allocator.allocate, wp.array.numpy
+    monkeypatch.setattr(device.default_allocator, "allocate", lambda size: allocated.append(size) or allocate(size))
+    monkeypatch.setattr(wp.array, "numpy", lambda self: read.append(self.size) or numpy(self))
+    generation = simulation.work.candidates.generation, simulation.work.pairs.generation
+    state, before = simulation.state, simulation.state.time
+    assert simulation.step().barriers > 0
+    assert (simulation.work.candidates.generation, simulation.work.pairs.generation) == generation
+    assert simulation.state is state and state.time > before
+    assert (allocated, read) == ([], [simulation.work.report.size])
+    simulation.work.pairs._allocate(2 * simulation.work.pairs.capacity)  # what the test counts with does count
+    assert allocated
+
+
+def test_a_step_leaves_the_state_that_it_starts_from():
+    model = pdipc.build(falling_cloth("float64"), "cpu")
+    state = model.initial_state()
+    kept = state.arrays()
+    result = step(model, state)
+    assert result.state is not state
+    assert all(np.array_equal(state.arrays()[name], kept[name]) for name in kept)
+    again = step(model, state, into=state)
+    assert again.state is state
+    assert all(np.array_equal(state.arrays()[name], result.state.arrays()[name]) for name in kept)
+
+
+def test_a_driver_without_loops_in_graphs(monkeypatch):
+    """Each kernel is launched alone, with the same bits, and the user is told."""
+    expected, counts = run("float64")
+    monkeypatch.setattr(pdipc.parallel.Device, "records_loops", False)
+    with pytest.warns(UserWarning, match="cpu has no loops in graphs"):
+        positions, found = run("float64")
+    assert np.array_equal(positions, expected)
+    assert found == counts
+
+
+def test_recording_allocates_nothing(monkeypatch):
+    """CUDA refuses memory inside the loops of a graph."""
+    simulation = pdipc.Simulation(falling_cloth("float64"), "cpu")
+    device, allocated, recorded = wp.get_device("cpu"), [], []
+    allocate, capture = device.default_allocator.allocate, pdipc.parallel.Device.capture
+
+    def counted(self, launches, keep_alive=None):
+        with monkeypatch.context() as patch:
+            patch.setattr(device.default_allocator, "allocate", lambda size: allocated.append(size) or allocate(size))
+            recorded.append(launches.__name__)
+            return capture(self, launches, keep_alive)
+
+    monkeypatch.setattr(pdipc.parallel.Device, "capture", counted)
+    simulation.step()
+    assert (allocated, recorded[0]) == ([], "whole_step")

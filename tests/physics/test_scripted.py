@@ -1,8 +1,10 @@
-"""Obstacles that are held up by what they push: they go as far as the step allows, and a converged step is one where they arrive."""
+"""What follows a script and is held up: it goes as far as the step allows, and a converged step is one where it arrives."""
 
 import numpy as np
+import pytest
 
 import pdipc
+from physics.scenes import cloth, floor, scene, watched
 
 
 def test_closing_boards_arrive():
@@ -22,5 +24,23 @@ def test_closing_boards_arrive():
         result = simulation.step()
         lag = np.abs(simulation.positions[assembly.kinematic_vertices] - assembly.kinematic_positions(simulation.state.time))
         assert lag.max() < 1e-9 or not result.converged
-        assert len(pdipc.find_intersections(simulation.positions, simulation.triangles, assembly.scripted)) == 0
+        assert len(pdipc.find_intersections(simulation.positions, simulation.triangles, assembly.obstacle)) == 0
     assert lag.max() < 1e-9
+
+
+@pytest.mark.parametrize("method", ["barrier", "paper"])
+@pytest.mark.parametrize("select", [{"nearest": [0.0, 0.02, 0.0]}, {"all": True}], ids=["one vertex", "all"])
+def test_a_pin_cannot_lead_a_cloth_through_an_obstacle_or_another_pinned_cloth(select, method):
+    """Held vertices stop before the floor's inside, or their edges would end up on both sides of it; so does a cloth held all over."""
+    led = [{"select": select, "motion": {"velocity": [0.0, -3.0, 0.0]}}]
+    held = [{"select": {"all": True}}]
+    sheets = [
+        cloth("sheet", (0.4, 0.4), (4, 4), at=(0.0, 0.02, 0.0), pins=led),
+        cloth("held", (0.9, 0.9), (2, 2), at=(0.02, 0.01, 0.03), pins=held),
+    ]
+    for bodies, obstacles in ((sheets[:1], [floor(3.0, at=(0.31, 0.0, 0.17))]), (sheets, [])):
+        simulation = watched(scene(bodies, obstacles, contact={"method": method}, max_outer=8))
+        results = [simulation.step() for _ in range(3)]
+        lowest = 0.0 if obstacles else 0.01
+        assert 0.0 < simulation.positions[: 5 * 5, 1].min() - lowest < 1e-3
+        assert method == "paper" or not results[-1].converged  # the script says 7 cm below

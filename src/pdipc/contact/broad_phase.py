@@ -27,7 +27,7 @@ class BroadPhase:
     def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
         """Lists every pair whose boxes overlap; a primitive's box holds, of each vertex v, x0_v and x1_v grown by reach_v (m).
 
-        Left out: pairs that share a vertex, and pairs of which all vertices are kinematic. Recordable.
+        Left out: pairs that share a vertex, and pairs of two obstacles. Recordable.
         """
         self.searcher.find(x0, x1, reach)
 

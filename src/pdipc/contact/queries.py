@@ -1,6 +1,7 @@
 """Many CCD queries at once, from NumPy."""
 
 import functools
+import numbers
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,25 +63,27 @@ def time_of_impact(
     Returns (n,) float64: a time up to which the distance provably stays above xi, within a hundredth of the starting gap of the
     earliest such time; 0 where the pair starts at xi or closer; inf where it is proven for all of [0, 1].
 
-    Raises ValueError for a wrong shape, kind or precision, a separation below zero, and numbers that are not finite.
+    Raises ValueError for a wrong shape, kind, precision or type, a separation below zero, and numbers that are not finite.
     """
     if kind not in KINDS:
         raise ValueError(f'kind is "{kind}"; it must be "vertex_triangle" or "edge_edge"')
     real = real_of(precision)
     points = np.asarray(points)
+    if points.dtype.kind not in "biuf":
+        raise ValueError(f"points holds {points.dtype}; it must hold real numbers")
     if points.ndim != 3 or points.shape[1:] != (8, 3):
         raise ValueError(f"points has shape {points.shape}; it must be (n, 8, 3): four vertices at the start, four at the end")
-    if not (np.isfinite(minimum_separation) and minimum_separation >= 0.0):
-        raise ValueError(f"minimum_separation is {minimum_separation}; it must be finite and not negative")
-    with np.errstate(over="ignore"):
+    if not (isinstance(minimum_separation, numbers.Real) and np.isfinite(minimum_separation) and minimum_separation >= 0.0):
+        raise ValueError(f"minimum_separation is {minimum_separation!r}; it must be one number, finite and not negative")
+    with np.errstate(over="ignore"):  # what is too large for the precision becomes infinite: points are refused, xi gives 0
         points = points.astype(real.numpy)
+        separation = real.numpy.type(minimum_separation)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=(1, 2)))
     if len(bad):
         raise ValueError(f"points[{bad[0]}] is not finite in {precision} (one of {len(bad)} such queries)")
     where = Device(device)
     n = len(points)
     times = wp.zeros(n, dtype=real.scalar, device=where.warp)
-    separation = real.numpy.type(minimum_separation)
     if float(separation) < minimum_separation:
         separation = np.nextafter(separation, real.numpy.type(np.inf))
     if n:

@@ -19,8 +19,10 @@ class Surface:
     """Primitives of all bodies and obstacles.
 
     triangles: (m,) vec3i; edges: (k,) vec2i, each edge of a triangle once, ends in ascending order; vertices: (s,) int32, those
-    that have a triangle; body_of_vertex: (n,) int32; kinematic: (n,) int32, 1 where the vertex is scripted. members: vertices
-    (s, 1), edges (k, 2) and triangles (m, 3) as NumPy arrays; codes: their Morton codes, uint64, ascending within a body.
+    that have a triangle; body_of_vertex: (n,) int32; kinematic: (n,) int32, 1 where the vertex is an obstacle's (obstacles may
+    pass through each other; a body's held vertices may meet nothing, or an edge that they pull would pass through).
+    members: vertices (s, 1), edges (k, 2) and triangles (m, 3) as NumPy arrays; codes: their Morton codes, uint64, ascending
+    within a body.
     """
 
     triangles: wp.array

@@ -36,6 +36,8 @@ from pdipc.precision import Real
 
 SEGMENTS = 4  # threads that share a row on CUDA (Appendix A)
 GROUP = 64  # vertices of a block of threads on CUDA
+STAGE = 1024  # coefficients that a block of threads fetches to fast memory at a time
+SHARED_BYTES = 44 * 1024  # fast memory of a block of threads, with some left for sums
 CHECK = 2  # iterations between two looks at the residual; even
 
 
@@ -186,8 +188,6 @@ class AJacobi(Solver):
         self._upload(system)
         self._x, self._before, self._constant, self._v = (self.zeros(self.real.vec3) for _ in range(4))
         self._kernels = kernels(self.real)
-        if self.grouped:
-            self._plan(system)
 
     @property
     def bytes(self) -> int:
@@ -196,50 +196,70 @@ class AJacobi(Solver):
         return p.paths * (size + 4 * (self.order - 1)) + len(p.rows) * (size + 12)
 
     def _upload(self, system: System) -> None:
+        """A-products, and room for the coefficients: by rows, or with `grouped` group by group."""
         p, device = self.products, self.device.warp
-        offsets = np.searchsorted(p.rows, np.arange(system.count + 1))
-        entries = sp.csr_matrix((np.zeros(len(p.rows)), p.columns, offsets), shape=(system.count, system.count))
-        self.coefficients = sparse_rows.Rows(self.device, self.real, entries, sliced=self.device.is_cuda and not self.grouped)
+        if self.grouped:
+            positions, self._values = self._plan(system)
+        else:
+            offsets = np.searchsorted(p.rows, np.arange(system.count + 1))
+            entries = sp.csr_matrix((np.zeros(len(p.rows)), p.columns, offsets), shape=(system.count, system.count))
+            self.coefficients = sparse_rows.Rows(self.device, self.real, entries)
+            positions, self._values = self.coefficients.positions, self.coefficients.values
 
         def integers(values: np.ndarray) -> wp.array:
             return wp.array(np.resize(values, max(1, values.size)).astype(np.int32), device=device)
 
         # A path without an edge is marked by a negative row.
         row = np.where(p.constant[p.starts[:-1]], -1 - p.rows, p.rows)
-        self._paths = [integers(row), integers(self.coefficients.positions), integers(p.starts), integers(p.between.ravel())]
+        self._paths = [integers(row), integers(positions), integers(p.starts), integers(p.between.ravel())]
         self._paths += [max(0, self.order - 1), wp.array(p.products.astype(self.real.numpy), device=device)]
 
-    def _plan(self, system: System) -> None:
-        """Groups of vertices, what each reads, and the columns of its rows numbered within that."""
-        p = self.products
+    def _plan(self, system: System) -> tuple[np.ndarray, wp.array]:
+        """Groups of vertices, what each reads, its rows one after the other with columns numbered within what it reads.
+
+        Returns where each entry of p(G) goes, and room for the entries.
+        """
+        p, limit = self.products, capacity_on_cuda(self.real)
         pattern = sp.csr_matrix((np.ones(len(p.rows)), (p.rows, p.columns)), shape=(system.count, system.count))
         size = GROUP
         while True:
             label = partition.groups(system.matrix, system.free, size)
             starts, vertices, ring = partition.neighbourhoods(pattern, label, 1)
             largest = int(np.diff(starts).max(initial=1))
-            if 3 * (largest + 1) * self.real.numpy.itemsize <= 48 * 1024 or size == 1:
+            if largest <= limit or size == 1:
                 break
             size = max(1, size // 2)
-        self.capacity = largest if self.device.is_cuda else max(1024, 1 << (largest - 1).bit_length())
+        if largest > limit:
+            raise ValueError(
+                f"a row of order {self.order} has {largest} coefficients; {limit} fit into fast memory: lower the order"
+            )
         self.groups = len(starts) - 1
         owner = np.repeat(np.arange(self.groups), np.diff(starts))
         key = owner.astype(np.int64) * system.count + vertices
         order = np.argsort(key)
         wanted = label[p.rows].astype(np.int64) * system.count + p.columns
         columns = order[np.searchsorted(key[order], wanted)] - starts[label[p.rows]]
-        own = np.bincount(owner[ring == 0], minlength=self.groups)
-        arrays = [starts, vertices, own, columns]
-        self._group_arrays = [wp.array(a.astype(np.int32), device=self.device.warp) for a in arrays]
+        first_rows = np.searchsorted(owner[ring == 0], np.arange(self.groups + 1))
+        rank = np.zeros(system.count, dtype=np.int64)
+        rank[vertices[ring == 0]] = np.arange(np.count_nonzero(ring == 0))
+        positions = np.empty(len(p.rows), dtype=np.int64)
+        positions[np.argsort(rank[p.rows], kind="stable")] = np.arange(len(p.rows))
+        lengths = np.bincount(rank[p.rows], minlength=first_rows[-1])
+        offsets = np.concatenate([[0], np.cumsum(lengths)])
+        placed = np.zeros(max(1, len(columns)), dtype=np.int32)
+        placed[positions] = columns
+        arrays = [starts, vertices, first_rows, placed, offsets]
+        self._group_arrays = [wp.array(np.resize(a, max(1, a.size)).astype(np.int32), device=self.device.warp) for a in arrays]
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
-        self._group_kernels = group_kernels(self.real, self.capacity)
+        self._group_kernels = group_kernels(self.real, limit)
+        return positions, self.zeros(self.real.scalar, len(placed))
 
     def prepare(self, contact: Contact | None) -> None:
         """Launches the inverse of the diagonal, and with it the A-coefficients (Eq. 14)."""
         if contact is not None and (contact.diagonal is not None or contact.apply is not None):
             raise ValueError('a-jacobi takes scalar contacts only (contact = "paper"); "matrix-powers" takes 3x3 blocks')
         super().prepare(contact)
-        inputs = [self.inverse, self.system.count, *self._paths, self.coefficients.values]
+        inputs = [self.inverse, self.system.count, *self._paths, self._values]
         self.device.launch(self._kernels.update, len(self.products.rows), inputs, grain=16)
 
     def solve(
@@ -286,13 +306,12 @@ class AJacobi(Solver):
             self.copy(self._constant, source)
 
     def _sweep(self, source: wp.array, target: wp.array, step: int) -> None:
-        entries = self.coefficients.arguments
         state = [self.total, self._constant, self._factors, self.left, self.limits[1], step, source, target]
         if self.grouped:
-            inputs = [*self._group_arrays, entries[0], entries[2], *state, self._group_partial]
+            inputs = [*self._group_arrays, self._values, *state, self._group_partial]
             self.sums.launch_groups(self._group_kernels.grouped_sweep, self.groups, inputs)
         else:
-            self.sums.launch(self._kernels.sweep, [*entries, *state, self.partial])
+            self.sums.launch(self._kernels.sweep, [*self.coefficients.arguments, *state, self.partial])
 
 
 def _quotient(coefficients: np.ndarray) -> np.ndarray:
@@ -423,13 +442,19 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(**locals())
 
 
-# The neighbourhood of the group in fast memory; SEGMENTS threads for each row, whose parts are added up over the warp.
+# The group's neighbourhood and, stretch by stretch, its coefficients are fetched to fast memory by all threads together; SEGMENTS
+# threads share a row and add their parts up (Appendix A, Fig. 17). All threads of the block pass every barrier and every shuffle.
 _GROUPED_SWEEP = """
 #if defined(__CUDA_ARCH__)
+#define MEET __syncthreads()
     __shared__ SCALAR cache[3 * CAPACITY];
+    __shared__ SCALAR staged[STAGE];
+    __shared__ int staged_column[STAGE];
     const int segments = SEGMENTS;
 #else
-    SCALAR cache[3 * CAPACITY];
+#define MEET
+    SCALAR cache[3 * CAPACITY], staged[STAGE];
+    int staged_column[STAGE];
     const int segments = 1;
 #endif
     const int base = starts.data[group];
@@ -439,20 +464,28 @@ _GROUPED_SWEEP = """
         const auto& p = x.data[vertex[k]];
         cache[3 * k] = p.c[0]; cache[3 * k + 1] = p.c[1]; cache[3 * k + 2] = p.c[2];
     }
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-    const int rows = own.data[group];
-    const int whole = (rows * segments + 31) / 32 * 32;  // whole warps, so that all their threads take part in the shuffle
+    const int* offset = offsets.data + first_rows.data[group];
+    const int rows = first_rows.data[group + 1] - first_rows.data[group];
+    const int segment = lane % segments, at_once = lanes / segments;
     SCALAR gamma = 0;
-    for (int k = lane; k < (segments == 1 ? rows : whole); k += lanes) {
-        const int row = k / segments;
+    for (int first = 0; first < rows; first += at_once) {
+        const int row = first + lane / segments;
+        const int end = offset[first + at_once < rows ? first + at_once : rows];
+        const int low = row < rows ? offset[row] : end, high = row < rows ? offset[row + 1] : end;
         SCALAR y[3] = {0, 0, 0};
-        if (row < rows) {
-            const int high = offsets.data[vertex[row] + 1];
-            for (int e = offsets.data[vertex[row]] + k % segments; e < high; e += segments) {
-                const SCALAR value = coefficients.data[e];
-                const SCALAR* other = cache + 3 * columns.data[e];
+        for (int begin = offset[first]; begin < end; begin += STAGE) {
+            const int stop = begin + STAGE < end ? begin + STAGE : end;
+            MEET;  // the last stretch was used, or the neighbourhood is complete
+            for (int e = begin + lane; e < stop; e += lanes) {
+                staged[e - begin] = coefficients.data[e];
+                staged_column[e - begin] = columns.data[e];
+            }
+            MEET;
+            int e = low > begin ? low : begin;
+            e += (segment + segments - (e - low) % segments) % segments;
+            for (; e < (high < stop ? high : stop); e += segments) {
+                const SCALAR value = staged[e - begin];
+                const SCALAR* other = cache + 3 * staged_column[e - begin];
                 y[0] += value * other[0]; y[1] += value * other[1]; y[2] += value * other[2];
             }
         }
@@ -461,7 +494,7 @@ _GROUPED_SWEEP = """
             for (int part = SEGMENTS / 2; part > 0; part /= 2) { y[c] += __shfl_down_sync(0xffffffffu, y[c], part, SEGMENTS); }
         }
 #endif
-        if (row < rows && k % segments == 0) {
+        if (row < rows && segment == 0) {
             const int v = vertex[row];
             SCALAR square = 0;
             for (int c = 0; c < 3; ++c) {
@@ -475,7 +508,14 @@ _GROUPED_SWEEP = """
         }
     }
     return gamma;
+#undef MEET
 """
+
+
+def capacity_on_cuda(real: Real) -> int:
+    """Vertices of the largest neighbourhood that fits into fast memory beside the staged coefficients."""
+    size = real.numpy.itemsize
+    return (SHARED_BYTES - STAGE * (size + 4)) // (3 * size)
 
 
 @functools.cache
@@ -484,7 +524,9 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(f"{__name__}.{capacity}")
     f = shared.functions(real)
-    source = _GROUPED_SWEEP.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity))
+    source = (
+        _GROUPED_SWEEP.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)).replace("STAGE", str(STAGE))
+    )
 
     @wp.func_native(source.replace("SEGMENTS", str(SEGMENTS)))
     def group_step(
@@ -493,7 +535,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         lanes: int,
         starts: wp.array(dtype=wp.int32),
         vertices: wp.array(dtype=wp.int32),
-        own: wp.array(dtype=wp.int32),
+        first_rows: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         offsets: wp.array(dtype=wp.int32),
         coefficients: wp.array(dtype=scalar),
@@ -509,7 +551,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         first: int,
         starts: wp.array(dtype=wp.int32),
         vertices: wp.array(dtype=wp.int32),
-        own: wp.array(dtype=wp.int32),
+        first_rows: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         offsets: wp.array(dtype=wp.int32),
         coefficients: wp.array(dtype=scalar),
@@ -532,7 +574,20 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         group = worker // lanes
         lane = worker % lanes
         gamma = group_step(
-            group, lane, lanes, starts, vertices, own, columns, offsets, coefficients, diagonal, constant, omega, x, before
+            group,
+            lane,
+            lanes,
+            starts,
+            vertices,
+            first_rows,
+            columns,
+            offsets,
+            coefficients,
+            diagonal,
+            constant,
+            omega,
+            x,
+            before,
         )
         f.store_sum(gamma, worker, partial_out)
 

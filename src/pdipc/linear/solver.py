@@ -31,9 +31,11 @@ class Solver:
     residual: (1,) on the device, the last solve's residual norm relative to `first`.
     first: (1,) on the device, the residual norm that the tolerance of the last solve referred to, N/sqrt(kg/s^2).
     recordable: whether `solve` may be called inside `device.capture`.
+    dropped: largest part of a row of the iteration matrix that was left out; 0 for all but A-Jacobi with `drop` or `split`.
     """
 
     recordable = True
+    dropped = 0.0
 
     def __init__(self, system: System, tolerance: float, max_iterations: int):
         if not 0.0 <= tolerance < 1.0:

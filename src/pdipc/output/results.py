@@ -185,6 +185,11 @@ class Run:
         return self.topology["scripted"]
 
     @cached_property
+    def obstacle(self) -> np.ndarray:
+        """(n,) bool: vertices of obstacles, which may pass through each other."""
+        return (np.array(self.body_kinds) == "obstacle")[self.topology["body_of_vertex"]]
+
+    @cached_property
     def body_names(self) -> list[str]:
         """Names of bodies, then of obstacles."""
         return [str(name) for name in self.topology["body_names"]]

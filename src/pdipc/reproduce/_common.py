@@ -97,7 +97,7 @@ def intersections(run: Run) -> list[int]:
     found = []
     with progress(f"{run.folder.name}: witness", run.frame_count) as advance:
         for frame in range(run.frame_count):
-            found.append(len(find_intersections(run.positions(frame), run.triangles, run.scripted)))
+            found.append(len(find_intersections(run.positions(frame), run.triangles, run.obstacle)))
             advance(frame + 1, "")
     return found
 

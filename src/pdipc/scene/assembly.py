@@ -150,6 +150,11 @@ class Assembly:
         return mask
 
     @property
+    def obstacle(self) -> np.ndarray:
+        """(n,) bool: vertices of obstacles, which may pass through each other."""
+        return np.array([body.kinematic for body in self.bodies])[self.body_of_vertex]
+
+    @property
     def kinematic_vertices(self) -> np.ndarray:
         """(k,) int32, ascending: the numbers of the scripted vertices."""
         return np.flatnonzero(self.scripted).astype(np.int32)

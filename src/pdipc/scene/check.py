@@ -190,7 +190,7 @@ def _separation(assembly: Assembly, precision: str) -> Iterator[Finding]:
 def _intersections(assembly: Assembly) -> tuple[set[tuple[int, int]], list[Finding]]:
     """Pairs of bodies that intersect, i <= j, and what there is to say."""
     triangles = assembly.triangles
-    pairs = find_intersections(assembly.positions, triangles, assembly.scripted)
+    pairs = find_intersections(assembly.positions, triangles, assembly.obstacle)
     owners = np.sort(assembly.body_of_vertex[triangles[pairs][:, :, 0]], axis=1)
     findings, touching = [], set()
     for i, j in np.unique(owners, axis=0):

@@ -72,12 +72,21 @@ class Simulation(Table):
     inner_iterations: int = Field(default=30, ge=1, description="Most local-global iterations in an outer iteration.")
     linear_solver: Literal[
         "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
-    ] = Field(default="auto", description='Solver of the global step; "auto": two-level, with the paper\'s contact a-jacobi.')
+    ] = Field(
+        default="auto",
+        description='Solver of the global step; "auto": two-level (on CUDA pcg), with the paper\'s contact a-jacobi.',
+    )
     linear_iterations: int = Field(default=20, ge=1, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
     solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that a-jacobi and matrix-powers take in one.")
+    solver_drop: NotNegative = Field(
+        default=0.0,
+        lt=1.0,
+        description="a-jacobi leaves out A-products that are below this part of the largest in their row (the paper: two or three "
+        "orders smaller); how much that is, is in the run's `solver_dropped`.",
+    )
     budget_ms: Positive | None = Field(
         default=None,
         description="Time after which a step takes no further outer iteration, ms; results then depend on the machine.",
