@@ -130,7 +130,7 @@ def _draw(theirs: Run, ours: Run, rows: list[tuple], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     last = ours.frame_count - 1
-    frames = [round(part * last) for part in (0.0, 0.5, 0.75, 1.0)]
+    frames = [0, min(theirs.frame_count - 1, last // 3), round(0.75 * last), last]  # the second is one that IPC has, too
     figure = plt.figure(figsize=(11, 9.2), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
     for line, (method, done) in zip(upper.subplots(2, len(frames)), (("IPC", theirs), ("this package", ours)), strict=True):
