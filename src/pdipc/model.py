@@ -265,11 +265,10 @@ def build(scene: Scene, device: str | None = None) -> Model:
 
 def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
     """m/s, along the body."""
-    stiff, dense = (
-        (of.young_modulus, of.density) if isinstance(of, SolidMaterial) else (of.membrane_stiffness, of.areal_density)
-    )
-    assert stiff is not None  # the schema fills it in
-    return float(np.sqrt(stiff / dense))
+    if isinstance(of, SolidMaterial):
+        return float(np.sqrt(of.young_modulus / of.density))
+    assert of.membrane_stiffness is not None  # its validator has set it
+    return float(np.sqrt(of.membrane_stiffness / of.areal_density))
 
 
 def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:

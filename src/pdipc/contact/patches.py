@@ -483,6 +483,7 @@ class PatchCulling:
         homes[0][self.surface.members[0].ravel()] = self.members[0].home.numpy()
         inside = total = 0
         for found, (first, second) in ((self.vertex_triangle, (0, 2)), (self.edge_edge, (1, 1))):
+            assert found.pairs is not None  # it is only while the list grows
             pairs = found.pairs.numpy()[: int(found.count.numpy()[0])]
             inside += int(np.count_nonzero(homes[first][pairs[:, 0]] == homes[second][pairs[:, 1]]))
             total += len(pairs)
