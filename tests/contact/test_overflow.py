@@ -19,16 +19,16 @@ ROOMS = {
 }
 
 
-def crowded(broad_phase):
+def crowded(broad_phase, method="barrier"):
     """A block falls on a folded sheet: lists are empty at first and grow over several steps."""
     sheet = cloth("sheet", [0.4, 0.4], [8, 8], at=(0, 0.01, 0), friction=0.3)
     block = solid("block", [0.1, 0.1, 0.1], [3, 3, 3], at=(0.02, 0.08, 0.01), velocity=[0, -2, 0])
-    contact = {"activation_distance": 3e-3, "broad_phase": broad_phase}
+    contact = {"activation_distance": 3e-3, "broad_phase": broad_phase, "method": method}
     return scene([block, sheet], [floor(2.0)], contact=contact)
 
 
-def run(broad_phase, *, recorded=True, watched=False):
-    simulation = pdipc.Simulation(crowded(broad_phase), "cpu")
+def run(broad_phase, *, recorded=True, watched=False, method="barrier"):
+    simulation = pdipc.Simulation(crowded(broad_phase, method), "cpu")
     simulation.work = Work(simulation.model, recorded=recorded)
     simulation.observe = Witness(simulation) if watched else None
     grown = []
@@ -63,6 +63,17 @@ def test_same_bits_from_the_smallest_buffers(rooms, broad_phase, ample, monkeypa
         if rooms != ["slots of a primitive"] and not (rooms == ["overlapping patches"] and broad_phase == "bvh"):
             assert grown
             assert all(grown)
+
+
+def test_the_papers_mode_grows_too(monkeypatch):
+    """Its pairs hold more of each pair, which has to grow with the rest."""
+    expected = run("patches", method="paper")
+    for name in ROOMS.values():
+        monkeypatch.setattr(*name)
+    positions, counts, grown, _ = run("patches", method="paper")
+    assert len(grown) > len(expected[2])
+    assert np.array_equal(positions, expected[0])
+    assert counts == expected[1]
 
 
 def test_a_step_taken_again_is_seen_once(ample, monkeypatch):

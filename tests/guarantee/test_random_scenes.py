@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 from physics.scenes import cloth, floor, scene, solid, watched
 
 import pdipc
+from pdipc.output.certify import certify
+from pdipc.output.results import open_run
+from pdipc.simulate import run_scene
 
 STEPS, OUTER = 3, 6
 
@@ -95,3 +98,30 @@ def test_fast_block_meets_a_thin_rod(precision, method, truncation):
     for _ in range(4):
         simulation.step()
     assert min(reach) < 0.0  # the block has come as far as the rod, and hangs over it
+
+
+@pytest.mark.parametrize(("method", "truncation"), [("barrier", "per_vertex"), ("paper", "global"), ("paper", "per_vertex")])
+@pytest.mark.parametrize(("precision", "place"), [("float64", (0, 0, 0)), ("float32", (300.0, -200.0, 500.0))])
+def test_a_bullet_through_stacked_cloth_is_certified(precision, place, method, truncation, tmp_path):
+    """20 m/s through four sheets, at the least separation that is not refused, with restitution: exact arithmetic finds no contact."""
+    least = 210 * float(np.spacing(np.dtype(precision).type(np.abs(place).max() + 1)))
+    gap = max(2e-3, 1.1 * least)
+    sheets = [
+        cloth(f"sheet{i}", (0.3, 0.3), (4, 4), at=np.add(place, [3e-3 * i, 0.05 + gap * i, -2e-3 * i]), rotation=(0, 7 * i, 0))
+        for i in range(4)
+    ]
+    bullet = {
+        "name": "bullet",
+        "mesh": {"shape": "sphere", "radius": 0.03, "cells": 2},
+        "translation": np.add(place, [0, 0.2, 0]),
+    }
+    bullet |= {"motion": {"velocity": (0.3, -20.0, 0.1)}}
+    contact = {"method": method, "truncation": truncation, "restitution": 1.0, "minimum_separation": least}
+    contact |= {"activation_distance": max(1.5e-3, 2 * least)}
+    made = scene(sheets, [floor(1.0, at=place), bullet], contact=contact, precision=precision, max_outer=6)
+    run_scene(made, tmp_path / "run", steps=3, device="cpu", certify=True)
+    certificate = certify(open_run(tmp_path / "run"))
+    assert certificate.segments >= 3
+    assert certificate.pairs > 500
+    assert certificate.hits == []
+    assert certificate.smallest_gap > 0.9 * least  # two float32 roundings of it

@@ -266,3 +266,15 @@ def test_winding_number_is_one_inside_and_zero_outside():
     corners = ball.vertices[ball.triangles]
     values = [winding_number(np.array(point), corners) for point in ([0, 0, 0], [0.6, 0.2, 0.5], [0, 1.1, 0], [5, 5, 5])]
     assert values == pytest.approx([1, 1, 0, 0], abs=1e-12)
+
+
+def test_two_sides_that_rounding_brings_together_are_refused():
+    """A sheet 0.2 mm thick, 5 km away: in float64 it is fine, in float32 its sides are in one place."""
+    material = {"young_modulus": 1e5, "poisson_ratio": 0.0}
+    mesh = {"shape": "box", "size": (0.05, 2e-4, 0.05), "cells": (2, 1, 2)}
+    body = {"name": "thin", "kind": "solid", "mesh": mesh, "material": material, "translation": (4e3, 5e3, 3e3)}
+    contact = {"minimum_separation": 0.06, "activation_distance": 0.2}
+    for precision, refused in (("float64", False), ("float32", True)):
+        found = check(Scene(bodies=[body], simulation={"precision": precision}, contact=contact))
+        assert any("intersect at the start" in str(each) and "in float32 coordinates" in str(each) for each in found) == refused
+        assert bool(found) == refused

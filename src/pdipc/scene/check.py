@@ -1,7 +1,7 @@
 """What is refused before a simulation begins, with every finding at once."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -72,10 +72,13 @@ def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Fi
         findings += _elements(assembly, body)
     findings += _selections(assembly)
     findings += _motions(assembly)
-    touching, found = _intersections(assembly)
-    findings += found
+    separation = _separation(assembly, precision) if complete else []
+    # what counts is where the simulation begins: rounding can bring two sides of a thin body into one place
+    assembly = replace(assembly, positions=assembly.positions.astype(precision).astype(np.float64))
+    touching, found = _intersections(assembly, precision)
+    findings += [*found, *separation]
     if complete:
-        findings += [*_separation(assembly, precision), *_too_close(assembly, touching)]
+        findings += _too_close(assembly, touching)
     return findings + list(_inside(assembly, touching))
 
 
@@ -187,7 +190,7 @@ def _separation(assembly: Assembly, precision: str) -> Iterator[Finding]:
         yield Finding(", ".join(map(_label, small[:5])), found, right)
 
 
-def _intersections(assembly: Assembly) -> tuple[set[tuple[int, int]], list[Finding]]:
+def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, int]], list[Finding]]:
     """Pairs of bodies that intersect, i <= j, and what there is to say."""
     triangles = assembly.triangles
     pairs = find_intersections(assembly.positions, triangles, assembly.obstacle)
@@ -197,7 +200,7 @@ def _intersections(assembly: Assembly) -> tuple[set[tuple[int, int]], list[Findi
         own = pairs[np.all(owners == (i, j), axis=1)]
         place = assembly.positions[triangles[own[0]]].mean(axis=(0, 1))
         where = _label(assembly.bodies[i]) + (f" and {_label(assembly.bodies[j])}" if i != j else "")
-        found = f"{len(own)} pairs of triangles intersect at the start, one near {_at(place)} m"
+        found = f"{len(own)} pairs of triangles intersect at the start, one near {_at(place)} m, in {precision} coordinates"
         findings.append(Finding(where, found, "move them apart" if i != j else "the surface must not pass through itself"))
         touching.add((int(i), int(j)))
     return touching, findings

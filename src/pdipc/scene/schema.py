@@ -351,7 +351,7 @@ class Selection(Table):
 
 
 class Pin(Table):
-    """Vertices held where they start, or led along a motion."""
+    """Vertices held where they start, or led along a motion, as far as nothing is in the way."""
 
     select: Selection = Field(description="Which vertices.")
     motion: Motion | None = Field(default=None, description="How the points that hold them move; absent: not at all.")
