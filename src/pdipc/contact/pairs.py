@@ -24,6 +24,7 @@ from pdipc.parallel import Device, Reducer, Span
 from pdipc.precision import Real, kernel
 
 FIRST_PAIRS = 1024  # room at first
+LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
 
 
 @functools.cache
@@ -32,6 +33,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     dist, bar = distance.functions(real), barrier.functions(real)
     far = wp.constant(real.scalar(1.0e30))
+    least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
 
     @wp.func
     def vertex_triangle_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
@@ -75,7 +77,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 active = int(0)
                 smallest = far
                 for k in range(begin, wp.min(begin + span.block, count[0])):
-                    gap = gap_of(x, quads[k], limits[k])
+                    # CCD has proven it positive; measured in this precision it may round to less, of which there is no logarithm
+                    gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
                     gaps_out[k] = gap
                     if gap < limits[k][1]:
                         active += 1
