@@ -103,5 +103,5 @@ class PairList:
         if average > self.room:
             self._room_for_slots(min(average, MOST_SLOTS))
         del self.pairs  # freed before the larger one is made
-        self.pairs = wp.zeros(min(found + found // 2, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
+        self.pairs = wp.zeros(min(found + found // 4, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
         return True
