@@ -63,8 +63,21 @@ class Simulation:
         return self.model.triangles
 
     def set_vertex_force(self, vertices: np.ndarray, forces: np.ndarray) -> None:
-        """Pulls the given vertices (k,) with forces (k, 3) in newtons from the next step on, in place of earlier ones."""
-        self.model.external.pulled = (np.asarray(vertices, dtype=np.int64), np.asarray(forces, dtype=np.float64))
+        """Pulls the given vertices (k,) with forces (k, 3) in newtons from the next step on, in place of earlier ones.
+
+        Raises ValueError for vertices that are not simulated, forces that are no finite numbers, or lengths that differ.
+        """
+        vertices, forces = np.asarray(vertices, dtype=np.int64), np.asarray(forces, dtype=np.float64)
+        if vertices.ndim != 1 or forces.shape != (len(vertices), 3):
+            raise ValueError(f"{vertices.shape} vertices and {forces.shape} forces; they must be (k,) and (k, 3)")
+        scripted = self.model.assembly.scripted
+        if len(unknown := vertices[(vertices < 0) | (vertices >= len(scripted))]):
+            raise ValueError(f"there is no vertex {unknown[0]}; vertices are 0 to {len(scripted) - 1}")
+        if len(held := vertices[scripted[vertices]]):
+            raise ValueError(f"vertex {held[0]} follows a script and cannot be pulled")
+        if len(wrong := np.flatnonzero(~np.isfinite(forces).all(axis=1))):
+            raise ValueError(f"the force on vertex {vertices[wrong[0]]} is {forces[wrong[0]].tolist()}; it must be finite")
+        self.model.external.pulled = (vertices, forces)
 
     def step(self) -> StepResult:
         """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them."""

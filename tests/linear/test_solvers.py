@@ -142,6 +142,16 @@ def test_iterations_are_capped_and_residual_is_honest():
             assert solver.residual.numpy()[0] == pytest.approx(np.sqrt(squares(x) / squares(start)), rel=1e-9)
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name != "direct"])
+def test_what_is_no_number_is_not_swallowed(name, precision):
+    """A force that is not a number must reach the solution, where the step notices it; a zero increment would pass for rest."""
+    system, start, b, _, _ = case("soft cloth", None, 0, Device("cpu"), real(precision))
+    b[np.argmax(meshes()["soft cloth"][0][:, 0]), 1] = np.nan
+    x = solve(make_solver(name, system, tolerance=0.1, max_iterations=3), start, b)
+    assert np.isnan(x).any()
+
+
 def test_nothing_to_solve():
     """All vertices prescribed, or a right-hand side that is met already."""
     x, triangles = systems.cloth_grid(5)

@@ -8,7 +8,7 @@ import pdipc
 from pdipc.forces import Loads
 from pdipc.model import build
 
-from .scenes import cloth, scene, solid
+from .scenes import cloth, floor, scene, solid
 
 FORCES = [
     {"kind": "wind", "velocity": [3.0, 1.0, -2.0], "start": 0.5},
@@ -56,3 +56,31 @@ def test_a_pull_that_is_let_go_no_longer_acts():
         speeds.append((mass @ simulation.state.velocities.numpy())[0] / weight)
     h = simulation.model.settings.time_step
     assert speeds == pytest.approx([3 * h, 3 * h], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "forces", "told"),
+    [
+        ([0], [[0.0, np.nan, 0.0]], "the force on vertex 0 is .*nan.*finite"),
+        ([0, 1], [[0.0, 1.0, 0.0]], r"\(2,\) vertices and \(1, 3\) forces"),
+        ([-1], [[0.0, 1.0, 0.0]], "there is no vertex -1"),
+        ([1000], [[0.0, 1.0, 0.0]], "there is no vertex 1000"),
+        ([27], [[0.0, 1.0, 0.0]], "vertex 27 follows a script"),
+    ],
+)
+def test_bad_pulls_are_refused(vertices, forces, told):
+    made = scene([solid("block", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 1, 0))], [floor()])
+    simulation = pdipc.Simulation(made, "cpu")
+    with pytest.raises(ValueError, match=told):
+        simulation.set_vertex_force(vertices, forces)
+
+
+def test_a_force_that_is_no_number_ends_the_step_where_it_began():
+    """Should one arise in spite of all, the step says so and keeps the last state."""
+    simulation = pdipc.Simulation(scene([solid("block", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 1, 0))]), "cpu")
+    before = simulation.positions
+    simulation.model.external.pulled = (np.array([3]), np.array([[0.0, np.nan, 0.0]]))
+    result = simulation.step()
+    assert not result.converged
+    assert "not finite" in result.message
+    assert np.array_equal(simulation.positions, before)

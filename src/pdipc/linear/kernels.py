@@ -114,8 +114,11 @@ def functions(real: Real) -> SimpleNamespace:
         residual = scalar(0.0)
         if first_out[0] > scalar(0.0):
             residual = norm / first_out[0]
-        residual_out[0] = residual
         condition_out[0] = wp.where(residual > tolerance, 1, 0)
+        if wp.isnan(gamma):  # one iteration carries it into x, where the step sees it
+            residual = gamma
+            condition_out[0] = 1
+        residual_out[0] = residual
 
     @wp.func
     def update_status(

@@ -265,7 +265,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             gamma = numbers[GAMMA]
             curvature = delta - numbers[BETA] * gamma / numbers[ALPHA]
-            if curvature > scalar(0.0):
+            if curvature > scalar(0.0) or wp.isnan(curvature):
                 numbers[ALPHA] = gamma / curvature
             else:
                 numbers[ALPHA] = scalar(0.0)
