@@ -7,6 +7,7 @@ import numpy as np
 
 from pdipc.parallel import Device
 from pdipc.precision import Real, real
+from pdipc.reproduce import _common
 from pdipc.reproduce.fig7 import Run, describe, loads, table_cloth
 
 # An iteration of order l expands the series by l terms. The first variant is what the others are measured by.
@@ -41,7 +42,7 @@ def measure(side: int, place: Device, precision: Real) -> list[tuple[int, str, f
 
 
 def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> Path:
-    """Writes fig8.csv and fig8.png to `out_dir`; small: two cloths of a few hundred vertices. Returns the path of the PNG."""
+    """Writes fig8.csv, fig8.txt and fig8.png to `out_dir`; small: two cloths of a few hundred vertices. Returns the path of the PNG."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -59,7 +60,12 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
         writer = csv.writer(file)
         writer.writerow(("dof", "variant", "terms_per_second", "relative_to_jacobi", "bytes"))
         writer.writerows(rows)
-    return out / "fig8.png"
+    best = max(rows, key=lambda row: row[3])
+    sentence = (
+        "Paper, Fig. 8: on a GPU order 3 expands the series of Eq. (10) up to 2.8 times as fast as Jacobi, less for larger problems. "
+        f"Here ({describe(place)}): at most {best[3]:.2f} times as fast, by {best[1]} at {best[0]:,} degrees of freedom."
+    )
+    return _common.conclude(out / "fig8.png", sentence)
 
 
 def _draw(rows: list[tuple], place: Device, precision: str):
@@ -78,6 +84,6 @@ def _draw(rows: list[tuple], place: Device, precision: str):
     axis.set_xticks(range(len(sizes)), [f"{size:,} DOF" for size in sizes])
     axis.set_ylabel("terms of the series per second,\n% of Jacobi")
     axis.set_title(f"A-Jacobi over problem sizes, {precision}, {describe(place)}")
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside lower center", ncols=len(VARIANTS) // 2, fontsize=8)
     axis.grid(axis="y", alpha=0.3)
     return figure
