@@ -77,9 +77,8 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
 
             try:
                 function(*given, **options)
-            except (
-                BrokenPipeError
-            ):  # the reader, such as `head`, has seen enough; nothing more can be printed, not even at exit
+            except BrokenPipeError:
+                # the reader, such as `head`, has seen enough; nothing more can be printed, not even at exit
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise typer.Exit(1) from None
             except (RunError, OSError, ValueError, IndexError) as error:  # SceneError is a ValueError

@@ -124,7 +124,7 @@ def test_patches_are_voxels():
     numbers = culling.statistics()
     assert numbers["inside"] + numbers["between"] == sum(map(len, pairs))
     boxes = [(low[tree.leaves + p], high[tree.leaves + p]) for p in range(culling.count)]
-    moving = [not tree.scripted.numpy()[p] for p in range(culling.count)]
+    moving = [not tree.obstacle.numpy()[p] for p in range(culling.count)]
     overlapping = sum(
         bool(np.all(boxes[p][0] <= boxes[q][1]) and np.all(boxes[q][0] <= boxes[p][1]) and (moving[p] or moving[q]))
         for p in range(culling.count)

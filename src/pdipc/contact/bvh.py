@@ -64,7 +64,7 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         begin: int,
@@ -78,8 +78,8 @@ def kernels() -> SimpleNamespace:
         query = wp.bvh_query_aabb(tree, low[v], high[v])
         while wp.bvh_query_next(query, j):
             t = triangles[j]
-            scripted = kinematic[v] + kinematic[t[0]] + kinematic[t[1]] + kinematic[t[2]]
-            if t[0] != v and t[1] != v and t[2] != v and scripted < 4:
+            obstacles = obstacle[v] + obstacle[t[0]] + obstacle[t[1]] + obstacle[t[2]]
+            if t[0] != v and t[1] != v and t[2] != v and obstacles < 4:
                 if found < room:
                     insert(begin, found, wp.vec2i(v, j), out)
                 found += 1
@@ -90,7 +90,7 @@ def kernels() -> SimpleNamespace:
         i: int,
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         begin: int,
@@ -105,8 +105,8 @@ def kernels() -> SimpleNamespace:
         while wp.bvh_query_next(query, j):
             if j > i:
                 b = edges[j]
-                scripted = kinematic[a[0]] + kinematic[a[1]] + kinematic[b[0]] + kinematic[b[1]]
-                if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1] and scripted < 4:
+                obstacles = obstacle[a[0]] + obstacle[a[1]] + obstacle[b[0]] + obstacle[b[1]]
+                if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1] and obstacles < 4:
                     if found < room:
                         insert(begin, found, wp.vec2i(i, j), out)
                     found += 1
@@ -118,7 +118,7 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         room: int,
@@ -126,14 +126,14 @@ def kernels() -> SimpleNamespace:
         found_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
-        found_out[i] = search_triangles(i, tree, vertices, triangles, kinematic, low, high, i * room, room, slots_out)
+        found_out[i] = search_triangles(i, tree, vertices, triangles, obstacle, low, high, i * room, room, slots_out)
 
     @wp.kernel(module=module)
     def find_edges(
         first: int,
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         room: int,
@@ -141,7 +141,7 @@ def kernels() -> SimpleNamespace:
         found_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
-        found_out[i] = search_edges(i, tree, edges, kinematic, low, high, i * room, room, slots_out)
+        found_out[i] = search_edges(i, tree, edges, obstacle, low, high, i * room, room, slots_out)
 
     @wp.kernel(module=module)
     def pack_triangles(
@@ -149,7 +149,7 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         room: int,
@@ -165,7 +165,7 @@ def kernels() -> SimpleNamespace:
             overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
         elif ends[i] <= pairs_out.shape[0]:
             if found[i] > room:
-                search_triangles(i, tree, vertices, triangles, kinematic, low, high, begin, found[i], pairs_out)
+                search_triangles(i, tree, vertices, triangles, obstacle, low, high, begin, found[i], pairs_out)
             else:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
@@ -175,7 +175,7 @@ def kernels() -> SimpleNamespace:
         first: int,
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
-        kinematic: wp.array(dtype=wp.int32),
+        obstacle: wp.array(dtype=wp.int32),
         low: wp.array(dtype=wp.vec3),
         high: wp.array(dtype=wp.vec3),
         room: int,
@@ -191,7 +191,7 @@ def kernels() -> SimpleNamespace:
             overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
         elif ends[i] <= pairs_out.shape[0]:
             if found[i] > room:
-                search_edges(i, tree, edges, kinematic, low, high, begin, found[i], pairs_out)
+                search_edges(i, tree, edges, obstacle, low, high, begin, found[i], pairs_out)
             else:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
@@ -240,6 +240,6 @@ class Bvh:
         for tree in self.trees:
             self.device.once(tree.refit)
         triangle_tree, edge_tree = self.trees
-        inputs = [triangle_tree.id, s.vertices, s.triangles, s.kinematic, *self.of_vertices]
+        inputs = [triangle_tree.id, s.vertices, s.triangles, s.obstacle, *self.of_vertices]
         self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
-        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.kinematic, *self.of_edges])
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.obstacle, *self.of_edges])

@@ -6,7 +6,7 @@ mesh. The hierarchy is a complete binary tree in one linear array: node 1 is the
 node i, and patch p is node `leaves + p`. Its structure never changes; its boxes are refitted, leaves to root, for each list.
 
 For each patch the tree gives the patches that it overlaps. Then every primitive tests its box against whole blocks: one
-comparison of WIDTH boxes gives a bit mask. Within a patch, the pairs to be considered (no common vertex, not all scripted) are
+comparison of WIDTH boxes gives a bit mask. Within a patch, the pairs to be considered (no common vertex, not of two obstacles) are
 pre-built, as a bit mask for each primitive.
 """
 
@@ -63,7 +63,7 @@ class Patches:
     high: wp.array(dtype=wp.vec3)
     neighbours_end: wp.array(dtype=wp.int32)  # of each patch: where its overlapping patches end in `neighbours`
     neighbours: wp.array(dtype=wp.int32)  # in ascending order
-    scripted: wp.array(dtype=wp.int32)  # of each patch: 1 where all vertices of all its primitives are kinematic
+    obstacle: wp.array(dtype=wp.int32)  # of each patch: 1 where all its primitives are obstacles
 
 
 @wp.struct
@@ -73,7 +73,7 @@ class Members:
     start: wp.array(dtype=wp.int32)  # (patches + 1,) position of a patch's first primitive
     home: wp.array(dtype=wp.int32)  # patch of each position
     inside: wp.array(dtype=wp.uint32)  # of each position: its partners in its own patch, as a mask
-    moving: wp.array(dtype=wp.uint32)  # of each patch: mask of the members that are not all kinematic
+    moving: wp.array(dtype=wp.uint32)  # of each patch: mask of the members that are no obstacles
     boxes: wp.array(dtype=wp.float32)  # (patches, 6, WIDTH): least x, y, z, greatest x, y, z
 
 
@@ -187,7 +187,7 @@ def kernels() -> SimpleNamespace:
                     q = node - patches.leaves
                     if (
                         overlap(low, high, patches.low[node], patches.high[node])
-                        and patches.scripted[p] + patches.scripted[q] < 2
+                        and patches.obstacle[p] + patches.obstacle[q] < 2
                     ):
                         if fill:
                             patches.neighbours[begin + found] = q
@@ -228,7 +228,7 @@ def kernels() -> SimpleNamespace:
         """Counts the triangles that the vertex at position r may meet; the first `room` of them go to `out`."""
         p = vertex_members.home[r]
         bit = wp.uint32(1) << wp.uint32(r - vertex_members.start[p])
-        scripted = vertex_members.moving[p] & bit == wp.uint32(0)
+        obstacle = vertex_members.moving[p] & bit == wp.uint32(0)
         v = vertices[r]
         low_v, high_v = low[v], high[v]
         first_neighbour = int(0)
@@ -241,7 +241,7 @@ def kernels() -> SimpleNamespace:
                 mask = overlapping(members.boxes, q, low_v, high_v)
                 if q == p:
                     mask = mask & vertex_members.inside[r]
-                elif scripted:
+                elif obstacle:
                     mask = mask & members.moving[q]
                 while mask != wp.uint32(0):
                     k = members.start[q] + lowest_bit(mask)
@@ -266,7 +266,7 @@ def kernels() -> SimpleNamespace:
         """Counts the edges after position r that the edge there may meet; the first `room` of them go to `out`."""
         p = members.home[r]
         own = r - members.start[p]
-        scripted = members.moving[p] & (wp.uint32(1) << wp.uint32(own)) == wp.uint32(0)
+        obstacle = members.moving[p] & (wp.uint32(1) << wp.uint32(own)) == wp.uint32(0)
         a = edges[r]
         low, high = load_low(members.boxes, p * 6 * width + own), load_high(members.boxes, p * 6 * width + own)
         first_neighbour = int(0)
@@ -279,7 +279,7 @@ def kernels() -> SimpleNamespace:
                 mask = overlapping(members.boxes, q, low, high)
                 if q == p:
                     mask = mask & members.inside[r]
-                elif scripted:
+                elif obstacle:
                     mask = mask & members.moving[q]
                 while mask != wp.uint32(0):
                     k = members.start[q] + lowest_bit(mask)
@@ -392,7 +392,7 @@ class PatchCulling:
         self.starts = divide(surface)
         count = self.count = len(self.starts[0]) - 1
         members = surface.members
-        scripted = [surface.kinematic_numpy[m].all(axis=1) for m in members]
+        obstacle = [surface.obstacle_numpy[m].all(axis=1) for m in members]
         homes = [np.repeat(np.arange(count), np.diff(start)) for start in self.starts]
 
         def upload(values: np.ndarray, dtype) -> wp.array:
@@ -402,12 +402,12 @@ class PatchCulling:
             return wp.zeros(max(1, size), dtype=dtype, device=device.warp)
 
         moving = [np.zeros(count, dtype=np.uint32) for _ in members]
-        for mask, home, start, still in zip(moving, homes, self.starts, scripted, strict=True):
+        for mask, home, start, still in zip(moving, homes, self.starts, obstacle, strict=True):
             bits = np.where(still, 0, 1 << (np.arange(len(home)) - start[home])).astype(np.uint32)
             np.bitwise_or.at(mask, home, bits)
         inside = [
-            _inside(members[0], members[2], homes[0], self.starts[2], scripted[0], scripted[2], False),
-            _inside(members[1], members[1], homes[1], self.starts[1], scripted[1], scripted[1], True),
+            _inside(members[0], members[2], homes[0], self.starts[2], obstacle[0], obstacle[2], False),
+            _inside(members[1], members[1], homes[1], self.starts[1], obstacle[1], obstacle[1], True),
             np.zeros(0, dtype=np.uint32),
         ]
         self.members = []
@@ -423,7 +423,7 @@ class PatchCulling:
         self.tree.leaves = 1 << max(0, count - 1).bit_length()
         low = np.full((2 * self.tree.leaves, 3), 3e38, dtype=np.float32)
         self.tree.low, self.tree.high = upload(low, wp.vec3), upload(-low, wp.vec3)
-        self.tree.scripted = upload(np.all([mask == 0 for mask in moving], axis=0).astype(np.int32), wp.int32)
+        self.tree.obstacle = upload(np.all([mask == 0 for mask in moving], axis=0).astype(np.int32), wp.int32)
         self.tree.neighbours_end = empty(count, wp.int32)
         self.found = empty(count, wp.int32)
         self.neighbour_count = empty(2, wp.int32)  # listed, and the most found: a later, shorter list must not hide an overflow
@@ -487,7 +487,7 @@ class PatchCulling:
             pairs = found.pairs.numpy()[: int(found.count.numpy()[0])]
             inside += int(np.count_nonzero(homes[first][pairs[:, 0]] == homes[second][pairs[:, 1]]))
             total += len(pairs)
-        own = self.count - int(self.tree.scripted.numpy().sum())
+        own = self.count - int(self.tree.obstacle.numpy().sum())
         overlapping = (int(self.found.numpy().sum()) - own) // 2
         return {"patches": self.count, "overlapping": overlapping, "inside": inside, "between": total - inside}
 
@@ -526,7 +526,7 @@ def divide(surface: Surface) -> list[np.ndarray]:
     return [np.array(end, dtype=np.int32) for end in ends]
 
 
-def _inside(first, second, home, starts, first_scripted, second_scripted, later: bool) -> np.ndarray:
+def _inside(first, second, home, starts, first_obstacle, second_obstacle, later: bool) -> np.ndarray:
     """(len(first),) uint32: for each primitive a mask of the partners in its own patch that it may meet.
 
     later: only partners after itself, for pairs of one kind.
@@ -537,7 +537,7 @@ def _inside(first, second, home, starts, first_scripted, second_scripted, later:
         there = partner < starts[home + 1]
         partner = np.minimum(partner, len(second) - 1)
         shared = (first[:, :, None] == second[partner][:, None, :]).any(axis=(1, 2))
-        wanted = there & ~shared & ~(first_scripted & second_scripted[partner])
+        wanted = there & ~shared & ~(first_obstacle & second_obstacle[partner])
         if later:
             wanted &= partner > np.arange(len(first))
         mask |= np.where(wanted, np.uint32(1 << bit), np.uint32(0)).astype(np.uint32)

@@ -19,7 +19,7 @@ class Surface:
     """Primitives of all bodies and obstacles.
 
     triangles: (m,) vec3i; edges: (k,) vec2i, each edge of a triangle once, ends in ascending order; vertices: (s,) int32, those
-    that have a triangle; body_of_vertex: (n,) int32; kinematic: (n,) int32, 1 where the vertex is an obstacle's (obstacles may
+    that have a triangle; body_of_vertex: (n,) int32; obstacle: (n,) int32, 1 where the vertex is an obstacle's (obstacles may
     pass through each other; a body's held vertices may meet nothing, or an edge that they pull would pass through).
     members: vertices (s, 1), edges (k, 2) and triangles (m, 3) as NumPy arrays; codes: their Morton codes, uint64, ascending
     within a body.
@@ -29,10 +29,10 @@ class Surface:
     edges: wp.array
     vertices: wp.array
     body_of_vertex: wp.array
-    kinematic: wp.array
+    obstacle: wp.array
     members: list[np.ndarray]
     codes: list[np.ndarray]
-    kinematic_numpy: np.ndarray
+    obstacle_numpy: np.ndarray
 
 
 def unique_edges(triangles: np.ndarray) -> np.ndarray:
@@ -58,14 +58,14 @@ def build(
     triangles: np.ndarray,
     rest_positions: np.ndarray,
     body_of_vertex: np.ndarray,
-    kinematic: np.ndarray,
+    obstacle: np.ndarray,
 ) -> Surface:
-    """The surface of triangles (m, 3) int32; rest_positions (n, 3), body_of_vertex (n,) and kinematic (n,) bool of all vertices."""
+    """The surface of triangles (m, 3) int32; rest_positions (n, 3), body_of_vertex (n,) and obstacle (n,) bool of all vertices."""
     triangles = np.ascontiguousarray(triangles, dtype=np.int32).reshape(-1, 3)
     rest = np.asarray(rest_positions, dtype=np.float64)
     body = np.asarray(body_of_vertex, dtype=np.int32)
-    if body.shape != rest.shape[:1] or np.shape(kinematic) != rest.shape[:1]:
-        raise ValueError(f"body_of_vertex and kinematic must have the shape ({len(rest)},)")
+    if body.shape != rest.shape[:1] or np.shape(obstacle) != rest.shape[:1]:
+        raise ValueError(f"body_of_vertex and obstacle must have the shape ({len(rest)},)")
     members = [np.unique(triangles).astype(np.int32)[:, None], unique_edges(triangles), triangles]
     bodies = [body[m[:, 0]] for m in members]
     codes = np.split(morton(np.concatenate([rest[m].mean(axis=1) for m in members])), np.cumsum([len(m) for m in members])[:-1])
@@ -81,8 +81,8 @@ def build(
         upload(members[1], wp.vec2i),
         upload(members[0].ravel(), wp.int32),
         upload(body, wp.int32),
-        upload(np.asarray(kinematic).astype(np.int32), wp.int32),
+        upload(np.asarray(obstacle).astype(np.int32), wp.int32),
         members,
         codes,
-        np.asarray(kinematic, dtype=bool),
+        np.asarray(obstacle, dtype=bool),
     )

@@ -13,7 +13,7 @@ from pdipc.scene.schema import Scene
 
 STEPS, SMALL_STEPS = 40, 12  # until the boards are closed
 FINAL, SMALL_FINAL = 0.3, 0.6  # of the distance of the boards that is then left
-IPC_STEPS = 12  # IPC goes no further, for its steps take minutes
+IPC_STEPS = 12  # IPC goes no further, for its steps take up to a minute
 H = 0.01  # s
 DENSITY, YOUNG_MODULUS = 1000.0, 5e4  # kg/m^3, Pa; as rigid as possible: Poisson's ratio is 0
 GAP = 0.005  # between body and boards at the start, m
@@ -80,7 +80,7 @@ def newton(assembly: Assembly) -> Callable[[int, _common.Arrays], tuple[_common.
 def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> Path:
     """Writes fig12.csv, fig12.txt and fig12.png to `out_dir`; returns the PNG.
 
-    The Armadillo of 55K tets of the optional data, of which IPC takes an hour; small, or without the data: a generated body.
+    The Armadillo of 55K tets of the optional data, of which IPC makes the first steps only; small, or without the data: a generated body.
     """
     out = Path(out_dir)
     out.mkdir(parents=True, exist_ok=True)
