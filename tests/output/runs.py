@@ -72,17 +72,18 @@ def advance(writer: RunWriter, state: np.ndarray, steps: range, checkpoint_every
     return state
 
 
-def begin(folder, as_json: str | None = None, **kwargs) -> tuple[RunWriter, np.ndarray]:
+def begin(folder, as_json: str | None = None, precision: str = "float32", **kwargs) -> tuple[RunWriter, np.ndarray]:
     """A new run with its start."""
     positions, topology = parts()
-    state = positions.astype(np.float32)
-    writer = RunWriter.create(folder, as_json or json.dumps(scene()), topology, {"device": "cpu"}, **kwargs)
+    state = positions.astype(precision)
+    meta = {"device": "cpu", "precision": precision}
+    writer = RunWriter.create(folder, as_json or json.dumps(scene()), topology, meta, **kwargs)
     writer.append(0, 0.0, state.astype(np.float64), {})
     writer.checkpoint(0, {"positions": state, "time": np.float64(0), "step": np.int64(0)})
     return writer, state
 
 
-def write(folder, steps: int = 8) -> np.ndarray:
+def write(folder, steps: int = 8, precision: str = "float32") -> np.ndarray:
     """A whole run; returns its last positions."""
-    writer, state = begin(folder)
+    writer, state = begin(folder, precision=precision)
     return advance(writer, state, range(1, steps + 1))

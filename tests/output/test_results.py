@@ -68,6 +68,7 @@ def test_resumed_and_uninterrupted_runs_give_the_same_files(tmp_path, damage):
         (folder / "frames/000006.npy.tmp").write_bytes(b"\x93NUMPY")
         (folder / "checkpoints/000006.npz.tmp").write_bytes(b"PK")
         (folder / "stats.jsonl.tmp").write_bytes(b"{")
+        (folder / "run.vtkhdf.tmp").write_bytes(b"\x89HDF")
     elif damage == "cut line":
         with open(folder / "stats.jsonl", "a") as file:
             file.write('{"step": 6, "ti')
@@ -84,7 +85,10 @@ def test_resumed_and_uninterrupted_runs_give_the_same_files(tmp_path, damage):
     step, arrays = writer.latest_checkpoint()
     assert step == (2 if "checkpoint" in damage else 4)
     runs.advance(writer, arrays["positions"], range(step + 1, 9))
-    assert contents(folder) == contents(tmp_path / "whole")
+    resumed, whole = contents(folder), contents(tmp_path / "whole")
+    assert resumed.keys() == whole.keys()
+    del resumed["run.vtkhdf"], whole["run.vtkhdf"]  # the same steps, in other places of the file: see test_vtkhdf.py
+    assert resumed == whole
 
 
 def test_flipped_bits_in_a_checkpoint_are_noticed(tmp_path):

@@ -5,10 +5,12 @@
     topology.npz    triangles, tets, body_of_vertex, scripted, body_names, body_kinds
     frames/         000000.npy, ...: positions (n, 3) of each step, m
     stats.jsonl     a line per frame: step, time, statistics of the step
+    run.vtkhdf      the same frames for ParaView, up to the last checkpoint
     checkpoints/    the last two states, bit for bit
     segments/       with --certify: the ends of every committed motion
 
 Every file is written under a temporary name and then renamed; a frame counts once its line in stats.jsonl is complete.
+run.vtkhdf alone grows in place: it is derived from the frames and written anew where a kill damaged it, see `vtkhdf`.
 """
 
 import json
@@ -26,7 +28,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1
-NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "frames", "checkpoints", "segments"}
+NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", "frames", "checkpoints", "segments"}
 CHECKPOINTS_KEPT = 2
 UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
@@ -38,8 +40,11 @@ class RunError(RuntimeError):
 class RunWriter:
     """Writes a run. Made by `create` or `resume`."""
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, run: "Run"):
+        self.folder = run.folder
+        self.topology = run.topology
+        self.real = run.meta.get("precision", "float64")
+        self.frames = [(record["step"], record["time"]) for record in run.records]
 
     @classmethod
     def create(
@@ -65,7 +70,7 @@ class RunWriter:
         _write_arrays(folder / "topology.npz", topology)
         _write_text(folder / "stats.jsonl", "")
         _write_text(folder / "run.json", json.dumps({"format": FORMAT, **_versions(), **meta}, indent=2) + "\n")
-        return cls(folder)
+        return cls(open_run(folder))
 
     @classmethod
     def resume(cls, folder: str | Path) -> "RunWriter":
@@ -74,8 +79,7 @@ class RunWriter:
         Raises RunError where there is no run or no valid checkpoint.
         """
         run = open_run(folder)
-        writer = cls(run.folder)
-        checkpoint = writer.latest_checkpoint()
+        checkpoint = cls(run).latest_checkpoint()
         if checkpoint is None:
             raise RunError(f"{folder} has no valid checkpoint to go on from; start again with --overwrite")
         last = checkpoint[0]
@@ -86,6 +90,8 @@ class RunWriter:
         for path in [path for name in ("frames", "checkpoints", "segments") for path in run.folder.glob(f"{name}/*.np?")]:
             if int(path.stem.split("_")[0]) > last:
                 _remove(path)
+        writer = cls(open_run(folder))
+        writer._update_vtkhdf()
         return writer
 
     def append(self, step: int, time: float, positions: np.ndarray, stats: dict[str, Any]) -> None:
@@ -96,13 +102,23 @@ class RunWriter:
         _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
         with open(self.folder / "stats.jsonl", "a") as file:
             file.write(_line({"step": int(step), "time": float(time), **stats}))
+        self.frames.append((int(step), float(time)))
 
     def checkpoint(self, step: int, arrays: dict[str, Any]) -> None:
-        """Saves the state after `step`, bit for bit, and drops all but the last two."""
+        """Saves the state after `step`, bit for bit, drops all but the last two, and brings run.vtkhdf up to date."""
         folder = self.folder / "checkpoints"
         _write_arrays(folder / f"{step:06d}.npz", arrays)
         for path in sorted(folder.glob("*.npz"))[:-CHECKPOINTS_KEPT]:
             _remove(path)
+        self._update_vtkhdf()
+
+    def _update_vtkhdf(self) -> None:
+        """Adds to run.vtkhdf the frames it lacks."""
+        from pdipc.output import vtkhdf
+
+        times = np.array([time for _, time in self.frames])
+        paths = [self.folder / "frames" / f"{step:06d}.npy" for step, _ in self.frames]
+        vtkhdf.update(self.folder / "run.vtkhdf", self.topology, self.real, times, paths)
 
     def latest_checkpoint(self) -> tuple[int, dict[str, np.ndarray]] | None:
         """Step and arrays of the newest checkpoint that is whole and whose frames are all there; None where there is none."""
