@@ -559,9 +559,7 @@ def _pressure(opened: "Run", frames: "Iterable[int]") -> "Field":
 @command()
 def export(
     folder: RunArgument,
-    to: Annotated[
-        Format, typer.Option("--format", help="usd: one animated file; ply, obj: a file a frame; vtk: for ParaView.")
-    ],
+    to: Annotated[Format, typer.Option("--format", help="usd: one animated file; ply, obj: a file a frame; vtk: PVD and VTU.")],
     out: Annotated[Path | None, typer.Option("--output", "-o", metavar="PATH", help="Default: beside the run folder.")] = None,
 ) -> None:
     """Write the frames of a run for other programs."""

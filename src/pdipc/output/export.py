@@ -50,21 +50,18 @@ def export_obj(run: Run, folder: Path) -> Path:
 
 
 def export_vtk(run: Run, folder: Path) -> Path:
-    """run.pvd, which ParaView opens with all times, and frame_000000.vtu, ...: tets, and triangles of what has none."""
+    """run.pvd, with all times, and frame_000000.vtu, ...: the mesh of run.vtkhdf, for programs that do not read that."""
     import meshio
 
-    kinds = np.array(run.body_kinds)
-    of_vertex = run.topology["body_of_vertex"]
-    surface = kinds[run.body_of_triangle] != "solid"
-    cells, bodies = [], []
-    for kind, elements in (("tetra", run.tets), ("triangle", run.triangles[surface])):
-        if len(elements):
-            cells.append((kind, elements))
-            bodies.append(of_vertex[elements[:, 0]].astype(np.int32))
+    from pdipc.output.vtkhdf import cells
+
+    drawn = cells(run.topology)
+    elements = [(kind, vertices) for kind, vertices, _ in drawn]
+    bodies = [body for _, _, body in drawn]
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">', "<Collection>"]
     for frame in range(run.frame_count):
         name = f"frame_{frame:06d}.vtu"
-        meshio.Mesh(run.positions(frame), cells, cell_data={"body": bodies}).write(folder / name)
+        meshio.Mesh(run.positions(frame), elements, cell_data={"body": bodies}).write(folder / name)
         lines.append(f'<DataSet timestep="{float(run.times[frame])!r}" part="0" file="{name}"/>')
     (folder / "run.pvd").write_text("\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
     return folder / "run.pvd"
