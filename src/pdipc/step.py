@@ -320,6 +320,7 @@ class Work:
             model.assembly.rest_positions,
             model.half_separation,
             settings.activation_distance,
+            settings.margin,
         )
         surfaces = (device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
         self.as_printed, self.truncated_tolerance = settings.method == "paper", OUTER_SQUARED**0.5
@@ -371,7 +372,7 @@ class Work:
     def list_pairs(self, x: wp.array) -> None:
         """Freezes the pairs that are active at x, outside of a step."""
         while True:
-            self.candidates.cover(x, x, self.model.settings.margin)
+            self.candidates.cover(x, x)
             self.pairs.freeze(self.candidates, x)
             if not self.grow():
                 return
@@ -393,8 +394,8 @@ class Work:
         start = [self.x_start, self.v_start, self.a_start, self.acceleration, self.target, model.free]
         device.launch(k.predict, n, [*start, model.real.scalar(model.settings.time_step), self.z, self.x_tilde])
         self.pairs.expect(self.x, self.x_tilde)
-        self.candidates.check(self.x, self.x_tilde)
-        device.when(self.candidates.needed, self._cover)
+        self.candidates.check(self.x, self.x)
+        device.when(self.candidates.needed, lambda: self.candidates.cover(self.x, self.x))
         self._mark("ccd")
 
     def outer_iteration(self) -> None:
@@ -409,7 +410,7 @@ class Work:
         device.launch(k.measure, n, [self.x, self.x_tilde, self.moved])
         self.largest.max(self.moved, self.residual)
         self._mark("solver")
-        self.candidates.check(self.x_tilde)
+        self.candidates.check(self.x, self.x_tilde)
         device.when(self.candidates.needed, self._cover)  # line 13
         self.truncation.truncate(self.candidates, self.x, self.x_tilde)  # lines 14 and 15
         self._mark("ccd")
@@ -472,7 +473,7 @@ class Work:
         rebound.limit(self.x_start, self.x, self.v_start, self.acceleration)
 
     def _cover(self) -> None:
-        self.candidates.cover(self.x, self.x_tilde, self.model.settings.margin)
+        self.candidates.cover(self.x, self.x_tilde)
 
     def _mark(self, stage: str) -> None:
         self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), self.clock])

@@ -52,12 +52,16 @@ def search(method, precision, rest, triangles, body, kinematic, x0, x1, reach, t
 
 
 def brute_force(skin, kinematic, x0, x1, reach):
-    """Sets of (vertex, triangle) and (edge, later edge) with overlapping boxes, in float64."""
-    low, high = np.minimum(x0, x1) - reach[:, None], np.maximum(x0, x1) + reach[:, None]
+    """Sets of (vertex, triangle) and (edge, later edge) whose boxes overlap as they move, in float64."""
 
     def overlapping(a, b):
-        al, ah, bl, bh = low[a].min(axis=1), high[a].max(axis=1), low[b].min(axis=1), high[b].max(axis=1)
-        meet = np.all((al[:, None] <= bh[None]) & (bl[None] <= ah[:, None]), axis=2)
+        above, below = (np.ones((3, len(a), len(b)), dtype=bool) for _ in range(2))  # a's box and b's, at both ends
+        for x in (x0, x1):
+            low, high = x - reach[:, None], x + reach[:, None]
+            for axis in range(3):
+                above[axis] &= low[a, axis].min(axis=1)[:, None] > high[b, axis].max(axis=1)
+                below[axis] &= high[a, axis].max(axis=1)[:, None] < low[b, axis].min(axis=1)
+        meet = ~(above | below).any(axis=0)
         shared = (a[:, None, :, None] == b[None, :, None, :]).any(axis=(2, 3))
         still = kinematic[a].all(axis=1)[:, None] & kinematic[b].all(axis=1)[None]
         return np.argwhere(meet & ~shared & ~still)
@@ -111,25 +115,29 @@ def test_patches_are_voxels():
         assert np.diff(starts).min() >= 0
         assert np.diff(starts).max() <= patches.WIDTH
     tree = culling.tree
-    low, high = tree.low.numpy(), tree.high.numpy()
-    for node in range(1, tree.leaves):
-        for child in (2 * node, 2 * node + 1):
-            assert np.all(low[node] <= low[child])
-            assert np.all(high[node] >= high[child])
+    nodes = tree.nodes
+    ends = [(nodes.begin_low.numpy(), nodes.begin_high.numpy()), (nodes.end_low.numpy(), nodes.end_high.numpy())]
+    for low, high in ends:
+        for node in range(1, tree.leaves):
+            for child in (2 * node, 2 * node + 1):
+                assert np.all(low[node] <= low[child])
+                assert np.all(high[node] >= high[child])
     for p in range(culling.count):
         for starts, members in zip(culling.starts, skin.members, strict=True):
-            x = np.concatenate([x0[members[starts[p] : starts[p + 1]].ravel()], x1[members[starts[p] : starts[p + 1]].ravel()]])
-            assert np.all(x >= low[tree.leaves + p])
-            assert np.all(x <= high[tree.leaves + p])
+            for x, (low, high) in zip((x0, x1), ends, strict=True):
+                own = x[members[starts[p] : starts[p + 1]].ravel()]
+                assert np.all(own >= low[tree.leaves + p])
+                assert np.all(own <= high[tree.leaves + p])
     numbers = culling.statistics()
     assert numbers["inside"] + numbers["between"] == sum(map(len, pairs))
-    boxes = [(low[tree.leaves + p], high[tree.leaves + p]) for p in range(culling.count)]
     moving = [not tree.obstacle.numpy()[p] for p in range(culling.count)]
-    overlapping = sum(
-        bool(np.all(boxes[p][0] <= boxes[q][1]) and np.all(boxes[q][0] <= boxes[p][1]) and (moving[p] or moving[q]))
-        for p in range(culling.count)
-        for q in range(p)
-    )
+
+    def meet(p, q):
+        above = np.all([low[tree.leaves + p] > high[tree.leaves + q] for low, high in ends], axis=0)
+        below = np.all([high[tree.leaves + p] < low[tree.leaves + q] for low, high in ends], axis=0)
+        return not np.any(above | below)
+
+    overlapping = sum(meet(p, q) and (moving[p] or moving[q]) for p in range(culling.count) for q in range(p))
     assert numbers["overlapping"] == overlapping
 
 

@@ -29,7 +29,7 @@ def truncated(motion, *, truncation="per_vertex", precision="float64", moving_fl
     start = x.numpy()
     x_tilde = wp.array(start + motion(start, model), dtype=model.real.vec3, device="cpu")
     while True:
-        work.candidates.cover(x, x_tilde, 0.0)
+        work.candidates.cover(x, x_tilde)
         work.truncation.truncate(work.candidates, x, x_tilde)
         if not work.grow():
             break

@@ -1,8 +1,11 @@
 """Collision culling (Algorithm 1, line 13; Section 7.2): which pairs of primitives may meet."""
 
+from typing import Any
+
 import warp as wp
 
 from pdipc.contact import bvh, patches
+from pdipc.contact.sieve import everything
 from pdipc.contact.surface import Surface
 from pdipc.parallel import Device
 from pdipc.precision import Real
@@ -22,14 +25,15 @@ class BroadPhase:
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device.warp)
         make = METHODS[AUTO if method == "auto" else method]
         self.searcher = make(device, real, surface, self.overflow)
+        self.everything = everything(real)
         self.lists = [self.searcher.vertex_triangle, self.searcher.edge_edge]
 
-    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array, sieve: Any = None) -> None:
         """Lists every pair whose boxes overlap; a primitive's box holds, of each vertex v, x0_v and x1_v grown by reach_v (m).
 
-        Left out: pairs that share a vertex, and pairs of two obstacles. Recordable.
+        Left out: pairs that share a vertex, pairs of two obstacles, and what a `Sieve` stops. Recordable.
         """
-        self.searcher.find(x0, x1, reach)
+        self.searcher.find(x0, x1, reach, self.everything if sieve is None else sieve)
 
     def restructure(self, x: wp.array, reach: wp.array) -> None:
         """Builds what `find` searches anew around x, for speed."""

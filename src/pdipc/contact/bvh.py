@@ -2,52 +2,63 @@
 
 The trees are refitted for every list and rebuilt now and then. Each vertex asks the tree of triangles, each edge the tree of
 edges; what it finds goes, in ascending order, into slots of its own, and the slots are then packed. What finds more than its
-slots hold searches again, straight into the list, and a list that is full says so: nothing is dropped.
+slots hold searches again, straight into the list, and a list that is full says so: nothing is dropped. Warp's trees know boxes
+that rest, so what they find is compared once more as it moves. (Conditions are nested where the last is dear: Warp evaluates
+both sides of an "and".)
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from pdipc.contact import sweep
+from pdipc.contact import sieve, sweep
 from pdipc.contact.surface import Surface
+from pdipc.contact.sweep import Box, Boxes, join, load, meet
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
 
 @functools.cache
-def kernels() -> SimpleNamespace:
-    module = wp.get_module(__name__)
-    module.options["enable_backward"] = False
+def kernels(real: Real) -> SimpleNamespace:
+    module = real.module(__name__)
+    passes = sieve.functions(real)
+    Sieve = passes.Sieve
+
+    @wp.func
+    def of_edge(boxes: Boxes, e: wp.vec2i) -> Box:
+        return join(load(boxes, e[0]), load(boxes, e[1]))
+
+    @wp.func
+    def of_triangle(boxes: Boxes, t: wp.vec3i) -> Box:
+        return join(join(load(boxes, t[0]), load(boxes, t[1])), load(boxes, t[2]))
 
     @wp.kernel(module=module)
-    def triangle_boxes(
+    def sweep_triangles(
         first: int,
         triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
         low_out: wp.array(dtype=wp.vec3),
         high_out: wp.array(dtype=wp.vec3),
     ):
         i = first + wp.tid()
-        t = triangles[i]
-        low_out[i] = wp.min(wp.min(low[t[0]], low[t[1]]), low[t[2]])
-        high_out[i] = wp.max(wp.max(high[t[0]], high[t[1]]), high[t[2]])
+        box = of_triangle(boxes, triangles[i])
+        low_out[i] = wp.min(box.begin_low, box.end_low)
+        high_out[i] = wp.max(box.begin_high, box.end_high)
 
     @wp.kernel(module=module)
-    def edge_boxes(
+    def sweep_edges(
         first: int,
         edges: wp.array(dtype=wp.vec2i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
         low_out: wp.array(dtype=wp.vec3),
         high_out: wp.array(dtype=wp.vec3),
     ):
         i = first + wp.tid()
-        e = edges[i]
-        low_out[i] = wp.min(low[e[0]], low[e[1]])
-        high_out[i] = wp.max(high[e[0]], high[e[1]])
+        box = of_edge(boxes, edges[i])
+        low_out[i] = wp.min(box.begin_low, box.end_low)
+        high_out[i] = wp.max(box.begin_high, box.end_high)
 
     @wp.func
     def insert(begin: int, held: int, pair: wp.vec2i, out: wp.array(dtype=wp.vec2i)):
@@ -65,8 +76,8 @@ def kernels() -> SimpleNamespace:
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         begin: int,
         room: int,
         out: wp.array(dtype=wp.vec2i),
@@ -75,14 +86,16 @@ def kernels() -> SimpleNamespace:
         v = vertices[i]
         found = int(0)
         j = int(0)
-        query = wp.bvh_query_aabb(tree, low[v], high[v])
+        box = load(boxes, v)
+        query = wp.bvh_query_aabb(tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
         while wp.bvh_query_next(query, j):
             t = triangles[j]
             obstacles = obstacle[v] + obstacle[t[0]] + obstacle[t[1]] + obstacle[t[2]]
-            if t[0] != v and t[1] != v and t[2] != v and obstacles < 4:
-                if found < room:
-                    insert(begin, found, wp.vec2i(v, j), out)
-                found += 1
+            if t[0] != v and t[1] != v and t[2] != v and obstacles < 4 and meet(box, of_triangle(boxes, t)):  # noqa: SIM102
+                if passes.vertex_triangle(sieve, v, t):
+                    if found < room:
+                        insert(begin, found, wp.vec2i(v, j), out)
+                    found += 1
         return found
 
     @wp.func
@@ -91,8 +104,8 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         begin: int,
         room: int,
         out: wp.array(dtype=wp.vec2i),
@@ -101,15 +114,18 @@ def kernels() -> SimpleNamespace:
         a = edges[i]
         found = int(0)
         j = int(0)
-        query = wp.bvh_query_aabb(tree, low[i], high[i])
+        box = of_edge(boxes, a)
+        query = wp.bvh_query_aabb(tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
         while wp.bvh_query_next(query, j):
             if j > i:
                 b = edges[j]
                 obstacles = obstacle[a[0]] + obstacle[a[1]] + obstacle[b[0]] + obstacle[b[1]]
-                if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1] and obstacles < 4:
-                    if found < room:
-                        insert(begin, found, wp.vec2i(i, j), out)
-                    found += 1
+                apart = a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1]
+                if apart and obstacles < 4 and meet(box, of_edge(boxes, b)):  # noqa: SIM102
+                    if passes.edge_edge(sieve, a, b):
+                        if found < room:
+                            insert(begin, found, wp.vec2i(i, j), out)
+                        found += 1
         return found
 
     @wp.kernel(module=module)
@@ -119,14 +135,14 @@ def kernels() -> SimpleNamespace:
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
-        found_out[i] = search_triangles(i, tree, vertices, triangles, obstacle, low, high, i * room, room, slots_out)
+        found_out[i] = search_triangles(i, tree, vertices, triangles, obstacle, boxes, sieve, i * room, room, slots_out)
 
     @wp.kernel(module=module)
     def find_edges(
@@ -134,14 +150,14 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
-        found_out[i] = search_edges(i, tree, edges, obstacle, low, high, i * room, room, slots_out)
+        found_out[i] = search_edges(i, tree, edges, obstacle, boxes, sieve, i * room, room, slots_out)
 
     @wp.kernel(module=module)
     def pack_triangles(
@@ -150,8 +166,8 @@ def kernels() -> SimpleNamespace:
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         room: int,
         slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
@@ -165,7 +181,7 @@ def kernels() -> SimpleNamespace:
             overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
         elif ends[i] <= pairs_out.shape[0]:
             if found[i] > room:
-                search_triangles(i, tree, vertices, triangles, obstacle, low, high, begin, found[i], pairs_out)
+                search_triangles(i, tree, vertices, triangles, obstacle, boxes, sieve, begin, found[i], pairs_out)
             else:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
@@ -176,8 +192,8 @@ def kernels() -> SimpleNamespace:
         tree: wp.uint64,
         edges: wp.array(dtype=wp.vec2i),
         obstacle: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        boxes: Boxes,
+        sieve: Sieve,
         room: int,
         slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
@@ -191,7 +207,7 @@ def kernels() -> SimpleNamespace:
             overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
         elif ends[i] <= pairs_out.shape[0]:
             if found[i] > room:
-                search_edges(i, tree, edges, obstacle, low, high, begin, found[i], pairs_out)
+                search_edges(i, tree, edges, obstacle, boxes, sieve, begin, found[i], pairs_out)
             else:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
@@ -203,14 +219,14 @@ class Bvh:
     """Candidate pairs by Warp's trees. `find` fills vertex_triangle and edge_edge."""
 
     def __init__(self, device: Device, real: Real, surface: Surface, overflow: wp.array):
-        self.device, self.surface, self.kernels, self.sweep = device, surface, kernels(), sweep.kernels(real)
+        self.device, self.surface, self.kernels, self.sweep = device, surface, kernels(real), sweep.kernels(real)
         n, m, k = len(surface.body_of_vertex), len(surface.triangles), len(surface.edges)
 
-        def boxes(count: int) -> tuple[wp.array, wp.array]:
+        def corners(count: int) -> tuple[wp.array, wp.array]:
             low, high = (wp.zeros(count, dtype=wp.vec3, device=device.warp) for _ in range(2))
             return low, high
 
-        self.of_vertices, self.of_triangles, self.of_edges = boxes(n), boxes(m), boxes(k)
+        self.of_vertices, self.of_triangles, self.of_edges = sweep.boxes(n, device), corners(m), corners(k)
         self.vertex_triangle = sweep.PairList(device, self.sweep, len(surface.vertices), overflow)
         self.edge_edge = sweep.PairList(device, self.sweep, k, overflow)
         self.trees = [wp.Bvh(*self.of_triangles), wp.Bvh(*self.of_edges)] if m else []
@@ -227,12 +243,12 @@ class Bvh:
 
     def _fit(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
         device, k, s = self.device, self.kernels, self.surface
-        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, *self.of_vertices])
-        device.launch(k.triangle_boxes, len(s.triangles), [s.triangles, *self.of_vertices, *self.of_triangles])
-        device.launch(k.edge_boxes, len(s.edges), [s.edges, *self.of_vertices, *self.of_edges])
+        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, self.of_vertices])
+        device.launch(k.sweep_triangles, len(s.triangles), [s.triangles, self.of_vertices, *self.of_triangles])
+        device.launch(k.sweep_edges, len(s.edges), [s.edges, self.of_vertices, *self.of_edges])
 
-    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
-        """Lists the pairs whose swept, inflated boxes overlap; see `broad_phase.BroadPhase.find`. Recordable."""
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array, sieve: Any) -> None:
+        """Lists pairs; see `broad_phase.BroadPhase.find`. Recordable."""
         if not self.trees:
             return
         k, s = self.kernels, self.surface
@@ -240,6 +256,6 @@ class Bvh:
         for tree in self.trees:
             self.device.once(tree.refit)
         triangle_tree, edge_tree = self.trees
-        inputs = [triangle_tree.id, s.vertices, s.triangles, s.obstacle, *self.of_vertices]
+        inputs = [triangle_tree.id, s.vertices, s.triangles, s.obstacle, self.of_vertices, sieve]
         self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
-        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.obstacle, *self.of_edges])
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.obstacle, self.of_vertices, sieve])

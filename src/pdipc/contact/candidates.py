@@ -1,7 +1,7 @@
 """Candidate pairs: what culling leaves, with the distances that each pair must keep.
 
-A list of candidates stays in use for as long as every vertex stays inside the box that the list was made for, usually a whole
-step and, at rest, many steps. Culling then costs one comparison a vertex.
+A list of candidates stays in use for as long as every vertex stays near an end of the motion that the list was made for: some
+outer iterations and, at rest, many steps. Culling then costs one comparison a vertex.
 """
 
 import functools
@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from pdipc.contact import distance
+from pdipc.contact import distance, sieve
 from pdipc.contact.broad_phase import BroadPhase
 from pdipc.contact.surface import Surface
 from pdipc.parallel import Device, Reducer, Span
@@ -87,54 +87,59 @@ def kernels(real: Real) -> SimpleNamespace:
                 limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, d_hat, same)
 
     @wp.kernel(module=module)
-    def cover(
+    def clear(first: int, away_out: wp.array(dtype=wp.int32)):
+        for i in range(4):
+            away_out[i] = 0
+
+    @wp.kernel(module=module)
+    def depart(
         first: int,
         x0: wp.array(dtype=vec3),
         x1: wp.array(dtype=vec3),
+        begin: wp.array(dtype=vec3),
+        end: wp.array(dtype=vec3),
         margin: scalar,
-        low_out: wp.array(dtype=vec3),
-        high_out: wp.array(dtype=vec3),
+        away: wp.array(dtype=wp.int32),
     ):
+        """away[0] and [1]: whether any x0 is more than the margin away from `begin`, and from `end`; away[2] and [3]: any x1."""
         i = first + wp.tid()
-        grow = vec3(margin, margin, margin)
-        low_out[i] = wp.min(x0[i], x1[i]) - grow
-        high_out[i] = wp.max(x0[i], x1[i]) + grow
+        # whoever writes, writes the same; a comparison with NaN is false: not near is away
+        if not (wp.length(x0[i] - begin[i]) <= margin):
+            away[0] = 1
+        if not (wp.length(x0[i] - end[i]) <= margin):
+            away[1] = 1
+        if not (wp.length(x1[i] - begin[i]) <= margin):
+            away[2] = 1
+        if not (wp.length(x1[i] - end[i]) <= margin):
+            away[3] = 1
 
     @wp.kernel(module=module)
-    def clear(first: int, flag_out: wp.array(dtype=wp.int32)):
-        flag_out[0] = 0
+    def decide(first: int, away: wp.array(dtype=wp.int32), needed_out: wp.array(dtype=wp.int32)):
+        needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
 
     @wp.kernel(module=module)
-    def outside(
+    def keep(
         first: int,
-        x: wp.array(dtype=vec3),
-        low: wp.array(dtype=vec3),
-        high: wp.array(dtype=vec3),
-        any_outside: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        # a comparison with NaN is false: not inside is outside
-        if not (wp.max(wp.max(low[i] - x[i], x[i] - high[i])) <= scalar(0.0)):
-            any_outside[0] = 1  # whoever writes, writes the same
-
-    @wp.kernel(module=module)
-    def reach_of(
-        first: int,
+        x0: wp.array(dtype=vec3),
+        x1: wp.array(dtype=vec3),
         half_separation: wp.array(dtype=scalar),
-        half_activation: scalar,
-        margin: scalar,
+        half_reach: scalar,
+        begin_out: wp.array(dtype=vec3),
+        end_out: wp.array(dtype=vec3),
         reach_out: wp.array(dtype=scalar),
     ):
         i = first + wp.tid()
-        reach_out[i] = half_separation[i] + half_activation + margin
+        begin_out[i] = x0[i]
+        end_out[i] = x1[i]
+        reach_out[i] = half_separation[i] + half_reach
 
     return SimpleNamespace(
         vertex_triangle_limits=vertex_triangle_limits,
         edge_edge_limits=edge_edge_limits,
-        cover=cover,
         clear=clear,
-        outside=outside,
-        reach_of=reach_of,
+        depart=depart,
+        decide=decide,
+        keep=keep,
     )
 
 
@@ -181,16 +186,21 @@ class Candidates:
         rest_positions: np.ndarray,
         half_separation: wp.array,
         activation_distance: float,
+        margin: float,
     ):
         n = len(rest_positions)
         self.device, self.real, self.surface, self.broad_phase = device, real, surface, broad_phase
-        self.half_separation, self.activation_distance = half_separation, activation_distance
+        self.half_separation, self.activation_distance, self.margin = half_separation, activation_distance, margin
         self.kernels = kernels(real)
         self.rest = wp.array(rest_positions, dtype=real.vec3, device=device.warp)
-        self.low = wp.zeros(n, dtype=real.vec3, device=device.warp)
-        self.high = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self.begin = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.reach = wp.zeros(n, dtype=real.scalar, device=device.warp)
+        self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
         self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.sieve = sieve.functions(real).Sieve()
+        self.sieve.begin, self.sieve.end, self.sieve.half_separation = self.begin, self.end, half_separation
+        self.sieve.reach = activation_distance + 2.0 * margin
         self.overflow = broad_phase.overflow
         self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
         self.vertex_triangle, self.edge_edge = self.lists
@@ -206,8 +216,8 @@ class Candidates:
 
     def invalidate(self) -> None:
         """Forgets the list: the next `check` asks for a new one."""
-        self.low.fill_(1.0e30)
-        self.high.fill_(-1.0e30)
+        self.begin.fill_(1.0e30)
+        self.end.fill_(1.0e30)
 
     def restructure(self, x: wp.array) -> None:
         """Renews the structures of the culling around x; what they find does not depend on it."""
@@ -221,21 +231,26 @@ class Candidates:
         self.invalidate()
         return True
 
-    def cover(self, x0: wp.array, x1: wp.array, margin: float) -> None:
-        """Lists every pair that can meet, or act, while each vertex v stays within `margin` of the box of x0_v and x1_v."""
-        n, k = len(x0), self.kernels
-        self.device.launch(k.cover, n, [x0, x1, self.real.scalar(margin), self.low, self.high])
-        half = 0.5 * self.activation_distance
-        self.device.launch(k.reach_of, n, [self.half_separation, half, margin, self.reach])
-        self.broad_phase.find(x0, x1, self.reach)
+    def cover(self, x0: wp.array, x1: wp.array) -> None:
+        """Lists every pair that can meet, or act, while each vertex stays within the margin of its way from x0 to x1, all of
+        them at the same fraction of it."""
+        half_reach = 0.5 * self.activation_distance + self.margin
+        inputs = [x0, x1, self.half_separation, half_reach, self.begin, self.end, self.reach]
+        self.device.launch(self.kernels.keep, len(x0), inputs)
+        self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
         common = [self.surface.body_of_vertex, self.rest, self.half_separation, self.activation_distance]
         primitives = (self.surface.triangles, self.surface.edges)
         for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
             inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]
-            self.device.launch_list(getattr(k, f"{own.kind}_limits"), own.capacity, inputs)
+            self.device.launch_list(getattr(self.kernels, f"{own.kind}_limits"), own.capacity, inputs)
 
-    def check(self, *positions: wp.array) -> None:
-        """needed[0] = 0 if every vertex of all `positions` is inside the box that the list was made for, else 1."""
-        self.device.launch_serial(self.kernels.clear, [self.needed])
-        for x in positions:
-            self.device.launch(self.kernels.outside, len(x), [x, self.low, self.high, self.needed])
+    def check(self, x0: wp.array, x1: wp.array) -> None:
+        """needed[0] = 0 if the list holds for the motion x0 -> x1, else 1.
+
+        It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
+        """
+        k = self.kernels
+        self.device.launch_serial(k.clear, [self.away])
+        inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), self.away]
+        self.device.launch(k.depart, len(x0), inputs)
+        self.device.launch_serial(k.decide, [self.away, self.needed])

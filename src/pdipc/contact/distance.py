@@ -137,24 +137,31 @@ def functions(real: Real) -> SimpleNamespace:
         return narrow(segment_weights(relative(a1, a0), relative(b0, a0), relative(b1, a0)))
 
     @wp.func
+    def origin_triangle_distance(a: wide3, b: wide3, c: wide3) -> wide:
+        """Distance of the origin and a triangle."""
+        w = triangle_weights(a, b, c)
+        return wp.length(w[1] * a + w[2] * b + w[3] * c)
+
+    @wp.func
+    def origin_segment_distance(a1: wide3, b0: wide3, b1: wide3) -> wide:
+        """Distance of the edges 0-a1 and b0-b1."""
+        w = segment_weights(a1, b0, b1)
+        return wp.length(w[1] * a1 + w[2] * b0 + w[3] * b1)
+
+    @wp.func
     def vertex_triangle_distance(p: vec3, a: vec3, b: vec3, c: vec3) -> scalar:
         """Distance of a vertex and a triangle, in metres."""
-        ra = relative(a, p)
-        rb = relative(b, p)
-        rc = relative(c, p)
-        w = triangle_weights(ra, rb, rc)
-        return scalar(wp.length(w[1] * ra + w[2] * rb + w[3] * rc))
+        return scalar(origin_triangle_distance(relative(a, p), relative(b, p), relative(c, p)))
 
     @wp.func
     def edge_edge_distance(a0: vec3, a1: vec3, b0: vec3, b1: vec3) -> scalar:
         """Distance of two edges, in metres."""
-        r1 = relative(a1, a0)
-        r2 = relative(b0, a0)
-        r3 = relative(b1, a0)
-        w = segment_weights(r1, r2, r3)
-        return scalar(wp.length(w[1] * r1 + w[2] * r2 + w[3] * r3))
+        return scalar(origin_segment_distance(relative(a1, a0), relative(b0, a0), relative(b1, a0)))
 
     return SimpleNamespace(
+        relative=relative,
+        origin_triangle_distance=origin_triangle_distance,
+        origin_segment_distance=origin_segment_distance,
         vertex_triangle_weights=vertex_triangle_weights,
         edge_edge_weights=edge_edge_weights,
         vertex_triangle_distance=vertex_triangle_distance,

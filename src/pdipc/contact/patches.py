@@ -12,35 +12,40 @@ pre-built, as a bit mask for each primitive.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from pdipc.contact import sweep
+from pdipc.contact import sieve, sweep
 from pdipc.contact.surface import MORTON_BITS, Surface
+from pdipc.contact.sweep import Box, Boxes, join, load, meet, store
 from pdipc.parallel import Device
 from pdipc.precision import Real
 
 WIDTH = 32  # primitives of one kind in a patch at most: bits of a mask
 FIRST_NEIGHBOURS = 8  # room for overlapping patches of a patch at first, on average
 
-# A block holds the boxes of a patch's primitives by coordinate, so that compilers compare many of them at once. Free places hold
-# an empty box, which overlaps nothing.
-_OVERLAPPING = """
-    const float* b = boxes.data + block * 192;
+# A block holds the boxes of a patch's primitives by coordinate, so that compilers compare many of them at once: the least and the
+# greatest x, y, z where the motion begins, then where it ends. Free places hold an empty box, which meets nothing.
+_MEETING = """
+    const float* b = boxes.data + block * 384;
     unsigned int mask = 0;
     for (int k = 0; k < 32; ++k) {
-        unsigned int apart = (unsigned int)(b[k] > high[0]) | (unsigned int)(b[32 + k] > high[1])
-            | (unsigned int)(b[64 + k] > high[2]) | (unsigned int)(b[96 + k] < low[0])
-            | (unsigned int)(b[128 + k] < low[1]) | (unsigned int)(b[160 + k] < low[2]);
+        unsigned int apart = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            const float* c = b + 32 * axis + k;
+            apart |= (unsigned int)(c[0] > box.begin_high[axis]) & (unsigned int)(c[192] > box.end_high[axis]);
+            apart |= (unsigned int)(c[96] < box.begin_low[axis]) & (unsigned int)(c[288] < box.end_low[axis]);
+        }
         mask |= (apart ^ 1u) << k;
     }
     return mask;
 """
 
 
-@wp.func_native(_OVERLAPPING)
-def overlapping(boxes: wp.array(dtype=wp.float32), block: int, low: wp.vec3, high: wp.vec3) -> wp.uint32: ...
+@wp.func_native(_MEETING)
+def meeting(boxes: wp.array(dtype=wp.float32), block: int, box: Box) -> wp.uint32: ...
 
 
 @wp.func_native("""
@@ -59,8 +64,7 @@ class Patches:
 
     leaves: int
     capacity: int  # of `neighbours`
-    low: wp.array(dtype=wp.vec3)  # of each node
-    high: wp.array(dtype=wp.vec3)
+    nodes: Boxes
     neighbours_end: wp.array(dtype=wp.int32)  # of each patch: where its overlapping patches end in `neighbours`
     neighbours: wp.array(dtype=wp.int32)  # in ascending order
     obstacle: wp.array(dtype=wp.int32)  # of each patch: 1 where all its primitives are obstacles
@@ -74,41 +78,39 @@ class Members:
     home: wp.array(dtype=wp.int32)  # patch of each position
     inside: wp.array(dtype=wp.uint32)  # of each position: its partners in its own patch, as a mask
     moving: wp.array(dtype=wp.uint32)  # of each patch: mask of the members that are no obstacles
-    boxes: wp.array(dtype=wp.float32)  # (patches, 6, WIDTH): least x, y, z, greatest x, y, z
+    boxes: wp.array(dtype=wp.float32)  # (patches, 12, WIDTH): see above
 
 
 @functools.cache
-def kernels() -> SimpleNamespace:
-    module = wp.get_module(__name__)
-    module.options["enable_backward"] = False
+def kernels(real: Real) -> SimpleNamespace:
+    module = real.module(__name__)
+    passes = sieve.functions(real)
+    Sieve = passes.Sieve
     width = wp.constant(WIDTH)
     nowhere = wp.constant(3.0e38)
 
     @wp.func
-    def overlap(low_a: wp.vec3, high_a: wp.vec3, low_b: wp.vec3, high_b: wp.vec3) -> bool:
-        return (
-            low_a[0] <= high_b[0]
-            and low_b[0] <= high_a[0]
-            and low_a[1] <= high_b[1]
-            and low_b[1] <= high_a[1]
-            and low_a[2] <= high_b[2]
-            and low_b[2] <= high_a[2]
-        )
-
-    @wp.func
-    def store(boxes: wp.array(dtype=wp.float32), slot: int, low: wp.vec3, high: wp.vec3):
-        begin = (slot / width) * 6 * width + slot % width
+    def store_in_block(boxes: wp.array(dtype=wp.float32), slot: int, box: Box):
+        begin = (slot / width) * 12 * width + slot % width
         for axis in range(3):
-            boxes[begin + axis * width] = low[axis]
-            boxes[begin + (3 + axis) * width] = high[axis]
+            boxes[begin + axis * width] = box.begin_low[axis]
+            boxes[begin + (3 + axis) * width] = box.begin_high[axis]
+            boxes[begin + (6 + axis) * width] = box.end_low[axis]
+            boxes[begin + (9 + axis) * width] = box.end_high[axis]
 
     @wp.func
-    def load_low(boxes: wp.array(dtype=wp.float32), begin: int) -> wp.vec3:
+    def corner(boxes: wp.array(dtype=wp.float32), begin: int) -> wp.vec3:
         return wp.vec3(boxes[begin], boxes[begin + width], boxes[begin + 2 * width])
 
     @wp.func
-    def load_high(boxes: wp.array(dtype=wp.float32), begin: int) -> wp.vec3:
-        return wp.vec3(boxes[begin + 3 * width], boxes[begin + 4 * width], boxes[begin + 5 * width])
+    def load_from_block(boxes: wp.array(dtype=wp.float32), p: int, k: int) -> Box:
+        begin = p * 12 * width + k
+        box = Box()
+        box.begin_low = corner(boxes, begin)
+        box.begin_high = corner(boxes, begin + 3 * width)
+        box.end_low = corner(boxes, begin + 6 * width)
+        box.end_high = corner(boxes, begin + 9 * width)
+        return box
 
     @wp.kernel(module=module)
     def fill_blocks(
@@ -117,21 +119,19 @@ def kernels() -> SimpleNamespace:
         triangle_members: Members,
         edges: wp.array(dtype=wp.vec2i),
         triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        of_vertices: Boxes,
     ):
         slot = first + wp.tid()
         p = slot / width
         r = edge_members.start[p] + slot % width
         if r < edge_members.start[p + 1]:
             e = edges[r]
-            store(edge_members.boxes, slot, wp.min(low[e[0]], low[e[1]]), wp.max(high[e[0]], high[e[1]]))
+            store_in_block(edge_members.boxes, slot, join(load(of_vertices, e[0]), load(of_vertices, e[1])))
         r = triangle_members.start[p] + slot % width
         if r < triangle_members.start[p + 1]:
             t = triangles[r]
-            least = wp.min(wp.min(low[t[0]], low[t[1]]), low[t[2]])
-            greatest = wp.max(wp.max(high[t[0]], high[t[1]]), high[t[2]])
-            store(triangle_members.boxes, slot, least, greatest)
+            box = join(join(load(of_vertices, t[0]), load(of_vertices, t[1])), load(of_vertices, t[2]))
+            store_in_block(triangle_members.boxes, slot, box)
 
     @wp.kernel(module=module)
     def fit_patches(
@@ -141,28 +141,26 @@ def kernels() -> SimpleNamespace:
         edge_members: Members,
         triangle_members: Members,
         vertices: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        of_vertices: Boxes,
     ):
         """The box of everything in a patch."""
         p = first + wp.tid()
-        least, greatest = wp.vec3(nowhere, nowhere, nowhere), wp.vec3(-nowhere, -nowhere, -nowhere)
+        box = Box()
+        box.begin_low = wp.vec3(nowhere, nowhere, nowhere)
+        box.begin_high = wp.vec3(-nowhere, -nowhere, -nowhere)
+        box.end_low = box.begin_low
+        box.end_high = box.begin_high
         for r in range(vertex_members.start[p], vertex_members.start[p + 1]):
-            least = wp.min(least, low[vertices[r]])
-            greatest = wp.max(greatest, high[vertices[r]])
+            box = join(box, load(of_vertices, vertices[r]))
         for k in range(edge_members.start[p + 1] - edge_members.start[p]):
-            least = wp.min(least, load_low(edge_members.boxes, p * 6 * width + k))
-            greatest = wp.max(greatest, load_high(edge_members.boxes, p * 6 * width + k))
+            box = join(box, load_from_block(edge_members.boxes, p, k))
         for k in range(triangle_members.start[p + 1] - triangle_members.start[p]):
-            least = wp.min(least, load_low(triangle_members.boxes, p * 6 * width + k))
-            greatest = wp.max(greatest, load_high(triangle_members.boxes, p * 6 * width + k))
-        patches.low[patches.leaves + p] = least
-        patches.high[patches.leaves + p] = greatest
+            box = join(box, load_from_block(triangle_members.boxes, p, k))
+        store(patches.nodes, patches.leaves + p, box)
 
     @wp.func
     def refit(patches: Patches, node: int):
-        patches.low[node] = wp.min(patches.low[2 * node], patches.low[2 * node + 1])
-        patches.high[node] = wp.max(patches.high[2 * node], patches.high[2 * node + 1])
+        store(patches.nodes, node, join(load(patches.nodes, 2 * node), load(patches.nodes, 2 * node + 1)))
 
     @wp.kernel(module=module)
     def refit_level(first: int, patches: Patches, begin: int):
@@ -176,19 +174,17 @@ def kernels() -> SimpleNamespace:
     @wp.func
     def traverse(patches: Patches, p: int, begin: int, fill: bool) -> int:
         """Counts, or lists from `begin` on, the patches that patch p overlaps, itself among them, left to right."""
-        low, high = patches.low[patches.leaves + p], patches.high[patches.leaves + p]
+        box = load(patches.nodes, patches.leaves + p)
         found = int(0)
         node = int(1)
         while node != 0:
-            if overlap(low, high, patches.low[node], patches.high[node]) and node < patches.leaves:
+            near = meet(box, load(patches.nodes, node))
+            if near and node < patches.leaves:
                 node = 2 * node
             else:
-                if node >= patches.leaves:
+                if near and node >= patches.leaves:
                     q = node - patches.leaves
-                    if (
-                        overlap(low, high, patches.low[node], patches.high[node])
-                        and patches.obstacle[p] + patches.obstacle[q] < 2
-                    ):
+                    if patches.obstacle[p] + patches.obstacle[q] < 2:
                         if fill:
                             patches.neighbours[begin + found] = q
                         found += 1
@@ -219,8 +215,8 @@ def kernels() -> SimpleNamespace:
         members: Members,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        of_vertices: Boxes,
+        sieve: Sieve,
         begin: int,
         room: int,
         out: wp.array(dtype=wp.vec2i),
@@ -230,15 +226,15 @@ def kernels() -> SimpleNamespace:
         bit = wp.uint32(1) << wp.uint32(r - vertex_members.start[p])
         obstacle = vertex_members.moving[p] & bit == wp.uint32(0)
         v = vertices[r]
-        low_v, high_v = low[v], high[v]
+        box = load(of_vertices, v)
         first_neighbour = int(0)
         if p > 0:
             first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
         found = int(0)
         for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
-            if overlap(low_v, high_v, patches.low[patches.leaves + q], patches.high[patches.leaves + q]):
-                mask = overlapping(members.boxes, q, low_v, high_v)
+            if meet(box, load(patches.nodes, patches.leaves + q)):
+                mask = meeting(members.boxes, q, box)
                 if q == p:
                     mask = mask & vertex_members.inside[r]
                 elif obstacle:
@@ -247,10 +243,11 @@ def kernels() -> SimpleNamespace:
                     k = members.start[q] + lowest_bit(mask)
                     mask = mask & (mask - wp.uint32(1))
                     t = triangles[k]
-                    if t[0] != v and t[1] != v and t[2] != v:
-                        if found < room:
-                            out[begin + found] = wp.vec2i(v, k)
-                        found += 1
+                    if t[0] != v and t[1] != v and t[2] != v:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                        if passes.vertex_triangle(sieve, v, t):
+                            if found < room:
+                                out[begin + found] = wp.vec2i(v, k)
+                            found += 1
         return found
 
     @wp.func
@@ -259,6 +256,7 @@ def kernels() -> SimpleNamespace:
         patches: Patches,
         members: Members,
         edges: wp.array(dtype=wp.vec2i),
+        sieve: Sieve,
         begin: int,
         room: int,
         out: wp.array(dtype=wp.vec2i),
@@ -268,15 +266,15 @@ def kernels() -> SimpleNamespace:
         own = r - members.start[p]
         obstacle = members.moving[p] & (wp.uint32(1) << wp.uint32(own)) == wp.uint32(0)
         a = edges[r]
-        low, high = load_low(members.boxes, p * 6 * width + own), load_high(members.boxes, p * 6 * width + own)
+        box = load_from_block(members.boxes, p, own)
         first_neighbour = int(0)
         if p > 0:
             first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
         found = int(0)
         for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
             q = patches.neighbours[n]
-            if q >= p and overlap(low, high, patches.low[patches.leaves + q], patches.high[patches.leaves + q]):
-                mask = overlapping(members.boxes, q, low, high)
+            if q >= p and meet(box, load(patches.nodes, patches.leaves + q)):
+                mask = meeting(members.boxes, q, box)
                 if q == p:
                     mask = mask & members.inside[r]
                 elif obstacle:
@@ -285,10 +283,11 @@ def kernels() -> SimpleNamespace:
                     k = members.start[q] + lowest_bit(mask)
                     mask = mask & (mask - wp.uint32(1))
                     b = edges[k]
-                    if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1]:
-                        if found < room:
-                            out[begin + found] = wp.vec2i(r, k)
-                        found += 1
+                    if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1]:  # noqa: SIM102
+                        if passes.edge_edge(sieve, a, b):
+                            if found < room:
+                                out[begin + found] = wp.vec2i(r, k)
+                            found += 1
         return found
 
     @wp.kernel(module=module)
@@ -299,15 +298,15 @@ def kernels() -> SimpleNamespace:
         members: Members,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        of_vertices: Boxes,
+        sieve: Sieve,
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
         r = first + wp.tid()
         found_out[r] = search_triangles(
-            r, patches, vertex_members, members, vertices, triangles, low, high, r * room, room, slots_out
+            r, patches, vertex_members, members, vertices, triangles, of_vertices, sieve, r * room, room, slots_out
         )
 
     @wp.kernel(module=module)
@@ -316,12 +315,13 @@ def kernels() -> SimpleNamespace:
         patches: Patches,
         members: Members,
         edges: wp.array(dtype=wp.vec2i),
+        sieve: Sieve,
         room: int,
         slots_out: wp.array(dtype=wp.vec2i),
         found_out: wp.array(dtype=wp.int32),
     ):
         r = first + wp.tid()
-        found_out[r] = search_edges(r, patches, members, edges, r * room, room, slots_out)
+        found_out[r] = search_edges(r, patches, members, edges, sieve, r * room, room, slots_out)
 
     @wp.kernel(module=module)
     def pack_triangles(
@@ -331,8 +331,8 @@ def kernels() -> SimpleNamespace:
         members: Members,
         vertices: wp.array(dtype=wp.int32),
         triangles: wp.array(dtype=wp.vec3i),
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
+        of_vertices: Boxes,
+        sieve: Sieve,
         room: int,
         slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
@@ -347,7 +347,7 @@ def kernels() -> SimpleNamespace:
         elif ends[r] <= pairs_out.shape[0]:
             if found[r] > room:
                 search_triangles(
-                    r, patches, vertex_members, members, vertices, triangles, low, high, begin, found[r], pairs_out
+                    r, patches, vertex_members, members, vertices, triangles, of_vertices, sieve, begin, found[r], pairs_out
                 )
             else:
                 for k in range(found[r]):
@@ -359,6 +359,7 @@ def kernels() -> SimpleNamespace:
         patches: Patches,
         members: Members,
         edges: wp.array(dtype=wp.vec2i),
+        sieve: Sieve,
         room: int,
         slots: wp.array(dtype=wp.vec2i),
         found: wp.array(dtype=wp.int32),
@@ -372,7 +373,7 @@ def kernels() -> SimpleNamespace:
             overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
         elif ends[r] <= pairs_out.shape[0]:
             if found[r] > room:
-                search_edges(r, patches, members, edges, begin, found[r], pairs_out)
+                search_edges(r, patches, members, edges, sieve, begin, found[r], pairs_out)
             else:
                 for k in range(found[r]):
                     pairs_out[begin + k] = slots[r * room + k]
@@ -388,7 +389,7 @@ class PatchCulling:
 
     def __init__(self, device: Device, real: Real, surface: Surface, overflow: wp.array):
         self.device, self.surface, self.overflow = device, surface, overflow
-        self.kernels, self.sweep = kernels(), sweep.kernels(real)
+        self.kernels, self.sweep = kernels(real), sweep.kernels(real)
         self.starts = divide(surface)
         count = self.count = len(self.starts[0]) - 1
         members = surface.members
@@ -415,21 +416,19 @@ class PatchCulling:
             m = Members()
             m.start, m.home = upload(self.starts[kind], wp.int32), upload(homes[kind], wp.int32)
             m.inside, m.moving = upload(inside[kind], wp.uint32), upload(moving[kind], wp.uint32)
-            nowhere = np.repeat(np.float32([3e38, -3e38]), 3 * WIDTH)  # free places overlap nothing
+            nowhere = np.tile(np.repeat(np.float32([3e38, -3e38]), 3 * WIDTH), 2)
             m.boxes = upload(np.tile(nowhere, count if kind else 0), wp.float32)
             self.members.append(m)
 
         self.tree = Patches()
         self.tree.leaves = 1 << max(0, count - 1).bit_length()
-        low = np.full((2 * self.tree.leaves, 3), 3e38, dtype=np.float32)
-        self.tree.low, self.tree.high = upload(low, wp.vec3), upload(-low, wp.vec3)
+        self.tree.nodes = sweep.boxes(2 * self.tree.leaves, device)
         self.tree.obstacle = upload(np.all([mask == 0 for mask in moving], axis=0).astype(np.int32), wp.int32)
         self.tree.neighbours_end = empty(count, wp.int32)
         self.found = empty(count, wp.int32)
         self.neighbour_count = empty(2, wp.int32)  # listed, and the most found: a later, shorter list must not hide an overflow
         self._room_for_neighbours(FIRST_NEIGHBOURS * count)
-        n = len(surface.body_of_vertex)
-        self.low, self.high = empty(n, wp.vec3), empty(n, wp.vec3)
+        self.of_vertices = sweep.boxes(len(surface.body_of_vertex), device)
         self.vertex_triangle = sweep.PairList(device, self.sweep, len(members[0]), overflow)
         self.edge_edge = sweep.PairList(device, self.sweep, len(members[1]), overflow)
 
@@ -450,16 +449,16 @@ class PatchCulling:
         self._room_for_neighbours(min(wanted + wanted // 2, sweep.LARGEST_LIST))
         return True
 
-    def find(self, x0: wp.array, x1: wp.array, reach: wp.array) -> None:
-        """Lists the pairs whose swept, inflated boxes overlap; see `broad_phase.BroadPhase.find`. Recordable."""
+    def find(self, x0: wp.array, x1: wp.array, reach: wp.array, sieve: Any) -> None:
+        """Lists pairs; see `broad_phase.BroadPhase.find`. Recordable."""
         if self.count == 0:
             return
         device, k, s, tree = self.device, self.kernels, self.surface, self.tree
-        of_vertices, (vertex_members, edge_members, triangle_members) = [self.low, self.high], self.members
-        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, *of_vertices])
-        inputs = [edge_members, triangle_members, s.edges, s.triangles, *of_vertices]
+        of_vertices, (vertex_members, edge_members, triangle_members) = self.of_vertices, self.members
+        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, of_vertices])
+        inputs = [edge_members, triangle_members, s.edges, s.triangles, of_vertices]
         device.launch(k.fill_blocks, self.count * WIDTH, inputs)
-        inputs = [tree, vertex_members, edge_members, triangle_members, s.vertices, *of_vertices]
+        inputs = [tree, vertex_members, edge_members, triangle_members, s.vertices, of_vertices]
         device.launch(k.fit_patches, self.count, inputs, grain=WIDTH)
         if device.is_cuda:
             begin = tree.leaves
@@ -473,9 +472,9 @@ class PatchCulling:
         inputs = [tree.neighbours_end, tree.capacity, self.neighbour_count, self.overflow]
         device.launch_serial(self.sweep.settle, inputs)
         device.launch(k.list_neighbours, self.count, [tree, self.found], grain=64)
-        inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, *of_vertices]
+        inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, of_vertices, sieve]
         self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
-        self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges])
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges, sieve])
 
     def statistics(self) -> dict[str, int]:
         """Of the last `find`: patches, overlapping pairs of patches, and candidates within a patch and between patches."""

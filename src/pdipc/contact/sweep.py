@@ -1,4 +1,4 @@
-"""What both ways of culling share: swept boxes of vertices, and lists of pairs that say when they are full."""
+"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full."""
 
 import functools
 from types import SimpleNamespace
@@ -12,6 +12,77 @@ from pdipc.precision import Real
 SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
+
+
+@wp.struct
+class Boxes:
+    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32, rounded outward.
+
+    At a fraction s of the way a thing is inside the box (1 - s) begin + s end.
+    """
+
+    begin_low: wp.array(dtype=wp.vec3)
+    begin_high: wp.array(dtype=wp.vec3)
+    end_low: wp.array(dtype=wp.vec3)
+    end_high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Box:
+    """One of `Boxes`."""
+
+    begin_low: wp.vec3
+    begin_high: wp.vec3
+    end_low: wp.vec3
+    end_high: wp.vec3
+
+
+@wp.func
+def load(boxes: Boxes, i: int) -> Box:
+    box = Box()
+    box.begin_low = boxes.begin_low[i]
+    box.begin_high = boxes.begin_high[i]
+    box.end_low = boxes.end_low[i]
+    box.end_high = boxes.end_high[i]
+    return box
+
+
+@wp.func
+def store(boxes: Boxes, i: int, box: Box):
+    boxes.begin_low[i] = box.begin_low
+    boxes.begin_high[i] = box.begin_high
+    boxes.end_low[i] = box.end_low
+    boxes.end_high[i] = box.end_high
+
+
+@wp.func
+def join(a: Box, b: Box) -> Box:
+    """The box around two."""
+    box = Box()
+    box.begin_low = wp.min(a.begin_low, b.begin_low)
+    box.begin_high = wp.max(a.begin_high, b.begin_high)
+    box.end_low = wp.min(a.end_low, b.end_low)
+    box.end_high = wp.max(a.end_high, b.end_high)
+    return box
+
+
+@wp.func
+def meet(a: Box, b: Box) -> bool:
+    """Whether they overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other."""
+    for axis in range(3):
+        if a.begin_low[axis] > b.begin_high[axis] and a.end_low[axis] > b.end_high[axis]:
+            return False
+        if a.begin_high[axis] < b.begin_low[axis] and a.end_high[axis] < b.end_low[axis]:
+            return False
+    return True
+
+
+def boxes(count: int, device: Device) -> Boxes:
+    """Room for `count` boxes; each is empty, and meets nothing."""
+    made = Boxes()
+    for name, value in (("begin_low", 3e38), ("begin_high", -3e38), ("end_low", 3e38), ("end_high", -3e38)):
+        setattr(made, name, wp.full(max(1, count), wp.vec3(value, value, value), dtype=wp.vec3, device=device.warp))
+    return made
 
 
 @functools.cache
@@ -37,13 +108,14 @@ def kernels(real: Real) -> SimpleNamespace:
         x0: wp.array(dtype=vec3),
         x1: wp.array(dtype=vec3),
         reach: wp.array(dtype=scalar),
-        low_out: wp.array(dtype=wp.vec3),
-        high_out: wp.array(dtype=wp.vec3),
+        boxes_out: Boxes,
     ):
         i = first + wp.tid()
         r = vec3(reach[i], reach[i], reach[i])
-        low_out[i] = below(wp.min(x0[i], x1[i]) - r)
-        high_out[i] = above(wp.max(x0[i], x1[i]) + r)
+        boxes_out.begin_low[i] = below(x0[i] - r)
+        boxes_out.begin_high[i] = above(x0[i] + r)
+        boxes_out.end_low[i] = below(x1[i] - r)
+        boxes_out.end_high[i] = above(x1[i] + r)
 
     @wp.kernel(module=module)
     def settle(

@@ -1,8 +1,9 @@
 """Truncation of the motion x -> x~ so that nothing meets (Algorithm 1, lines 13 to 15), vertex by vertex.
 
 Every pass runs conservative CCD on the linear motion from x to the float positions that would be committed. Vertices of pairs
-that meet are shortened by the pair's time, and the pass is repeated with a smaller back-off until one finds no hit: that pass
-proves the positions that are committed. Shortened motions stay inside the swept boxes, so the candidate list stays complete.
+that meet are shortened by the pair's time, candidates are listed again where that takes vertices out of the motion that the list
+was made for, and the pass is repeated with a smaller back-off until one finds no hit: that pass proves the positions that are
+committed.
 
 The paper truncates every vertex by the one smallest time (`per_vertex=False`): correct, but one collision anywhere then
 drags every body of the scene (docs/paper_map.md).
@@ -216,5 +217,7 @@ class Truncation:
             if len(self.rigid_begin):
                 device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
             device.launch(k.shorten, n, [self.multiplier, self.passes, x, x_tilde, self.fraction, self.x_end])
+            candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
+            device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
 
         device.loop(self.going, sweep)

@@ -7,6 +7,7 @@ import warp as wp
 
 from pdipc.contact import surface
 from pdipc.contact.patches import PatchCulling
+from pdipc.contact.sieve import everything
 from pdipc.parallel import Device
 from pdipc.precision import real
 from pdipc.reproduce import _common
@@ -24,9 +25,9 @@ def patches_of(vertices: np.ndarray, triangles: np.ndarray, device: Device) -> t
     culling = PatchCulling(device, number, place, wp.zeros(1, dtype=wp.int32, device=device.warp))
     x = wp.array(vertices, dtype=number.vec3, device=device.warp)
     reach = wp.zeros(n, dtype=number.scalar, device=device.warp)
-    culling.find(x, x, reach)
+    culling.find(x, x, reach, everything(number))
     while culling.grow():
-        culling.find(x, x, reach)
+        culling.find(x, x, reach, everything(number))
     starts = culling.starts[2]
     return culling, np.repeat(np.arange(len(starts) - 1), np.diff(starts))
 
@@ -34,7 +35,7 @@ def patches_of(vertices: np.ndarray, triangles: np.ndarray, device: Device) -> t
 def boxes(culling: PatchCulling, level: int) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corners (k, 3), m, of the boxes that are not empty on a level of the tree; 0 is the root."""
     nodes = slice(1 << level, 2 << level)
-    low, high = culling.tree.low.numpy()[nodes], culling.tree.high.numpy()[nodes]
+    low, high = culling.tree.nodes.begin_low.numpy()[nodes], culling.tree.nodes.begin_high.numpy()[nodes]
     there = (low <= high).all(axis=1)
     return low[there].astype(float), high[there].astype(float)
 
