@@ -90,7 +90,7 @@ def test_too_many_pairs_for_an_index(monkeypatch):
     """Where a list would be longer than its index can count, it is refused instead of cut."""
     monkeypatch.setattr(sweep, "FIRST_PAIRS", 50)
     monkeypatch.setattr(sweep, "LARGEST_LIST", 100)
-    simulation = pdipc.Simulation(crowded("patches"), "cpu")
+    simulation = pdipc.Simulation(crowded("bvh"), "cpu")
     with pytest.raises(MemoryError, match="candidate pairs: the motion of a step or the activation distance is too large"):
         for _ in range(6):
             simulation.step()
