@@ -1,8 +1,9 @@
 """Culling: patches (Section 7.2) against trees over primitives and IPC Toolkit's: `python benchmarks/culling.py [--small]`.
 
-A cloth above a ball (sparse) and a pile of wavy sheets (contact-rich), 10K to 200K triangles. Each method lists the pairs of
-boxes that overlap; ours vertex-triangle and edge-edge pairs, IPC Toolkit's too. Median of several runs, after a first one that
-builds what is kept between steps. Writes benchmarks/results/culling.json.
+A cloth above a ball (sparse) and a pile of wavy sheets (rich), both trembling, and the pile turning about the vertical by up to
+five edges (fast); 10K to 200K triangles. Vertex-triangle and edge-edge pairs that boxes leave, ours as they move along, IPC Toolkit's swept;
+and, of ours, what the sieve leaves of them (contact/sieve.py), which is what a step uses. Median of several runs, after a first
+one that builds what is kept between steps. Writes benchmarks/results/culling.json.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import ipctk
 import numpy as np
 import warp as wp
 
-from pdipc.contact import broad_phase, surface
+from pdipc.contact import broad_phase, sieve, surface
 from pdipc.parallel import Device
 from pdipc.precision import real
 from pdipc.scene.generators import Grid, Sphere
@@ -55,9 +56,11 @@ def timed(action) -> list[float]:
 
 
 def measure(frame: str, triangles: int) -> list[dict]:
-    x0, faces, body = {"sparse": sparse, "rich": rich}[frame](triangles)
-    edge = 1.0 / round((triangles / 2) ** 0.5)
+    x0, faces, body = {"sparse": sparse, "rich": rich, "fast": rich}[frame](triangles)
+    edge = 1.0 / round((triangles / (2 if frame == "sparse" else 20)) ** 0.5)
     x1 = x0 + 0.1 * edge * np.random.default_rng(0).standard_normal(x0.shape)
+    if frame == "fast":
+        x1 += 5 * edge / 0.7 * np.stack([x0[:, 2], 0 * x0[:, 0], -x0[:, 0]], axis=1)
     reach = np.full(len(x0), 0.05 * edge)
     rows = []
 
@@ -65,25 +68,30 @@ def measure(frame: str, triangles: int) -> list[dict]:
         row = {"frame": frame, "triangles": len(faces), "method": method, "median_ms": statistics.median(times)}
         row |= {"spread_ms": max(times) - min(times), "build_ms": build_ms, "pairs": pairs, **more}
         rows.append(row)
-        print(f"{frame:7} {len(faces):7} {method:24} {row['median_ms']:9.2f} ms  {pairs:9} pairs", flush=True)
+        print(f"{frame:7} {len(faces):7} {method:28} {row['median_ms']:9.2f} ms  {pairs:9} pairs", flush=True)
 
     for threads in (1, None):
         device, number = Device("cpu", threads), real("float64")
         skin = surface.build(device, faces, x0, body, np.zeros(len(x0), bool))
         arrays = [wp.array(v, dtype=number.vec3, device="cpu") for v in (x0, x1)] + [wp.array(reach, dtype=wp.float64)]
+        near = sieve.functions(number).Sieve()
+        near.begin, near.end, near.reach = arrays[0], arrays[1], 2 * float(reach[0])
+        near.half_separation = wp.zeros(len(x0), dtype=wp.float64)
         for method in ("patches", "bvh"):
             start = time.perf_counter()
             search = broad_phase.BroadPhase(device, number, skin, method)
             build_ms = 1e3 * (time.perf_counter() - start)
             search.restructure(arrays[0], arrays[2])
-            while True:
-                search.find(*arrays)
-                if not search.grow():
-                    break
-            graph = device.capture(lambda search=search, arrays=arrays: search.find(*arrays), search)
-            count = sum(int(found.count.numpy()[0]) for found in search.lists)
-            more = search.searcher.statistics() if method == "patches" else {}
-            add(f"{method}, {device.threads} threads", timed(graph.launch), count, build_ms, **more)
+            for label, used in (("boxes", sieve.everything(number)), ("sieve", near)):
+                inputs = [*arrays, used]
+                while True:
+                    search.find(*inputs)
+                    if not search.grow():
+                        break
+                graph = device.capture(lambda search=search, inputs=inputs: search.find(*inputs), search)
+                count = sum(int(found.count.numpy()[0]) for found in search.lists)
+                more = search.searcher.statistics() if method == "patches" else {}
+                add(f"{method}, {label}, {device.threads} threads", timed(graph.launch), count, build_ms, **more)
     mesh = ipctk.CollisionMesh(x0, ipctk.edges(faces), faces.astype(np.int32))
     for name in ("BVH", "LBVH", "SweepAndPrune", "SpatialHash", "HashGrid"):
         if not hasattr(ipctk, name) or (name in ("SpatialHash", "HashGrid") and triangles > 60_000):
@@ -103,9 +111,9 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="1K triangles only, and no file is written")
     options = parser.parse_args()
     sizes = (1000,) if options.small else (10_000, 30_000, 100_000, 200_000)
-    rows = [row for frame in ("sparse", "rich") for size in sizes for row in measure(frame, size)]
+    rows = [row for frame in ("sparse", "rich", "fast") for size in sizes for row in measure(frame, size)]
     exponents = {}
-    for frame in ("sparse", "rich"):
+    for frame in ("sparse", "rich", "fast"):
         for method in dict.fromkeys(row["method"] for row in rows):
             own = [row for row in rows if row["method"] == method and row["frame"] == frame]
             if len(own) > 1:
