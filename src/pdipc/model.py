@@ -64,6 +64,9 @@ class State:
             accelerations=wp.clone(self.accelerations),
         )
 
+    def __deepcopy__(self, memo: dict) -> "State":
+        return self.copy()
+
     def arrays(self) -> dict[str, Any]:
         """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
         return {

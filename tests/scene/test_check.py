@@ -267,6 +267,12 @@ def test_everything_is_found_at_once_though_a_mesh_and_names_are_missing():
         assemble(scene)
 
 
+@pytest.mark.parametrize("scene", ["thin_rod", {"bodies": []}, None])
+def test_what_is_no_scene(scene):
+    with pytest.raises(TypeError, match=f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use"):
+        check(scene)
+
+
 def test_refuse_says_everything_in_one_error():
     scene = Scene(bodies=[Solid(name="a", mesh=BOX), Cloth(name="b", mesh=GRID, pins=[Pin(select=NOWHERE)])])
     with pytest.raises(SceneError, match="cannot be simulated, 2 things to put right:") as caught:

@@ -233,8 +233,12 @@ def assemble(scene: Scene) -> Assembly:
 def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
     """What `assemble` makes, of all that can be read and is known, and a line for each thing that is not.
 
-    None where not a single body can be read.
+    None where not a single body can be read. Raises TypeError for what is no `Scene`.
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use pdipc.Scene(**tables) or pdipc.load_scene(path)"
+        )
     problems: list[str] = []
     unread: set[str] = set()  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
