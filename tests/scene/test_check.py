@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pdipc.model import build
 from pdipc.scene import generators
 from pdipc.scene.assembly import assemble
 from pdipc.scene.check import (
@@ -276,9 +277,33 @@ def test_what_is_no_scene(scene):
 def test_refuse_says_everything_in_one_error():
     scene = Scene(bodies=[Solid(name="a", mesh=BOX), Cloth(name="b", mesh=GRID, pins=[Pin(select=NOWHERE)])])
     with pytest.raises(SceneError, match="cannot be simulated, 2 things to put right:") as caught:
-        refuse(scene)
+        refuse(scene, assemble(scene), "float64")
     assert len(str(caught.value).splitlines()) == 3
-    refuse(Scene(bodies=[Solid(name="a", mesh=BOX)]))
+    scene = Scene(bodies=[Solid(name="a", mesh=BOX)])
+    refuse(scene, assemble(scene), "float64")
+
+
+@pytest.mark.parametrize(
+    ("method", "simulation", "found"),
+    [
+        ("barrier", {"linear_solver": "a-jacobi"}, '"a-jacobi" cannot take the contacts of contact.method = "barrier"'),
+        ("barrier", {"solver_drop": 0.01}, 'is 0.01, but only a-jacobi has A-products; the solver is "auto"'),
+        ("paper", {"linear_solver": "pcg", "solver_drop": 0.01}, 'only a-jacobi has A-products; the solver is "pcg"'),
+        ("paper", {"linear_solver": "auto", "solver_drop": 0.01}, ""),
+        ("paper", {"linear_solver": "a-jacobi"}, ""),
+    ],
+)
+def test_settings_that_do_not_go_together(method, simulation, found):
+    """The check finds what a run refuses, beside what else is wrong."""
+    scene = Scene(
+        bodies=[Solid(name="a", mesh=BOX, pins=[Pin(select=NOWHERE)])], simulation=simulation, contact={"method": method}
+    )
+    text = "\n".join(map(str, check(scene)))
+    assert found in text and "selects no vertex" in text
+    assert len(text.splitlines()) == 1 + bool(found)
+    with pytest.raises(SceneError) as caught:
+        build(scene, "cpu")
+    assert found in str(caught.value)
 
 
 # --- the distances that the check uses ---

@@ -41,7 +41,7 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     if isinstance(scene, Assembly):
         return _check(scene, precision or "float64")
     assembly, problems = gather(scene)
-    findings = []
+    findings = [*_settings(scene)]
     for problem in problems:
         where, _, found = problem.partition(": ")
         findings.append(Finding(where, found))
@@ -51,12 +51,24 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     return findings + _check(assembly, precision, complete=not problems)
 
 
-def refuse(scene: Scene | Assembly, precision: str | None = None) -> None:
-    """Raises SceneError with all findings of `check` where there are any."""
-    findings = check(scene, precision)
+def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
+    """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`."""
+    findings = [*_settings(scene), *check(assembly, precision)]
     if findings:
         found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
         raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
+
+
+def _settings(scene: Scene) -> Iterator[Finding]:
+    """Settings of the solver that do not go together."""
+    method, solver, drop = scene.contact.method, scene.simulation.linear_solver, scene.simulation.solver_drop
+    aggregates = solver == "a-jacobi" or (solver == "auto" and method == "paper")
+    if aggregates and method == "barrier":
+        found = f'"{solver}" cannot take the contacts of contact.method = "{method}"'
+        yield Finding("simulation.linear_solver", found, "take another solver, such as matrix-powers, or the paper's contact")
+    if drop > 0.0 and not aggregates:
+        found = f'is {drop:g}, but only a-jacobi has A-products; the solver is "{solver}"'
+        yield Finding("simulation.solver_drop", found, "leave it out")
 
 
 def smallest_separation(assembly: Assembly, precision: str) -> float:
