@@ -88,6 +88,7 @@ def test_bundled_scenes_are_listed():
         (["run", "squeeze", "-o", "nowhere", "--resume"], 1, "does not exist"),
         (["check", "nowhere"], 1, "nowhere does not exist"),
         (["render", "nowhere", "-o", "a.png", "--size", "big"], 2, "--size"),
+        (["render", "nowhere", "-o", "a.png", "--size", "9000x100"], 2, "--size"),
         (["render", "nowhere", "-o", "a.png", "--view", "up"], 2, "--view"),
         (["render", "nowhere", "-o", "a.bmp"], 2, "--output"),
         (["export", "nowhere", "--format", "stl"], 2, "--format"),

@@ -32,6 +32,12 @@ def live(request):
     shown.view.server.stop()
 
 
+@pytest.mark.parametrize("host", ["999.1.1.1", "192.0.2.1"])
+def test_a_host_that_is_not_this_machine_is_refused(host):
+    with pytest.raises(OSError, match=f'host "{host}" is no address of this machine'):
+        viewer.Live(scene(**CLOTH), host=host, port=8700)
+
+
 @pytest.mark.parametrize("live", [CLOTH], indirect=True)
 def test_vertices_are_updated_in_place_and_buttons_obeyed(live):
     meshes, first = list(live.view.meshes), live.simulation.positions

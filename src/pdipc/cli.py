@@ -519,10 +519,12 @@ def render(
 
     try:
         width, height = (int(part) for part in size.lower().split("x"))
-        if min(width, height) < 16:
+        if min(width, height) < 16 or max(width, height) > pictures.LARGEST:
             raise ValueError
     except ValueError:
-        raise typer.BadParameter(f'"{size}"; it must be like 1280x800', param_hint="--size") from None
+        raise typer.BadParameter(
+            f'"{size}"; it must be like 1280x800, each 16 to {pictures.LARGEST}', param_hint="--size"
+        ) from None
     try:
         x, y, z = pictures.VIEW if view is None else (float(part) for part in view.split(","))
         if not 0.0 < x * x + y * y + z * z < float("inf"):

@@ -25,20 +25,18 @@ from pdipc.constraints import (
 from pdipc.contact import broad_phase, surface
 from pdipc.forces import ExternalForces
 from pdipc.linear.solver import Solver
-from pdipc.linear.solvers import SOLVERS, make_solver
+from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
 from pdipc.parallel import Device
 from pdipc.precision import Real, real
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
-from pdipc.scene.errors import SceneError
 from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
 # The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
 DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": {"barrier": "pcg", "paper": "a-jacobi"}}
-UNFIT = {"barrier": ("a-jacobi",), "paper": ()}  # A-products cannot take 3x3 contacts
 INNER_TOLERANCE = 0.2
 
 
@@ -63,6 +61,9 @@ class State:
             velocities=wp.clone(self.velocities),
             accelerations=wp.clone(self.accelerations),
         )
+
+    def __deepcopy__(self, memo: dict) -> "State":
+        return self.copy()
 
     def arrays(self) -> dict[str, Any]:
         """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
@@ -175,7 +176,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
     sim = scene.simulation
     place = Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
-    refuse(assembly, number.name)
+    refuse(scene, assembly, number.name)
     h = sim.time_step / sim.substeps
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)
@@ -188,15 +189,6 @@ def build(scene: Scene, device: str | None = None) -> Model:
     if truncation == "auto":
         truncation = "global" if method == "paper" else "per_vertex"
     name = DEFAULT_SOLVER["cuda" if place.is_cuda else "cpu"][method] if sim.linear_solver == "auto" else sim.linear_solver
-    if name in UNFIT[method]:
-        raise SceneError(
-            f'simulation.linear_solver is "{name}", which cannot take the contacts of contact.method '
-            f'"{method}"; it must be one of: {", ".join(other for other in SOLVERS if other not in UNFIT[method])}'
-        )
-    if sim.solver_drop > 0.0 and name != "a-jacobi":
-        raise SceneError(
-            f'simulation.solver_drop is {sim.solver_drop:g}, but only a-jacobi has A-products; the solver is "{name}"'
-        )
     options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
     if name == "a-jacobi":
         options["drop"] = sim.solver_drop

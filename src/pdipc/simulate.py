@@ -38,7 +38,7 @@ class Simulation:
     """A scene in motion: a model, its state and its buffers.
 
     device: "cpu", "cuda:0", or None for the scene's choice. observe(x, x_end): see `pdipc.step.step`.
-    state: the current one, whose arrays every step overwrites (`copy.deepcopy` keeps it).
+    state: the current one, whose arrays every step overwrites (`state.copy()` keeps it).
     """
 
     def __init__(self, scene: Scene | Model, device: str | None = None, observe: Callable | None = None):
@@ -67,7 +67,10 @@ class Simulation:
 
         Raises ValueError for vertices that are not simulated, forces that are no finite numbers, or lengths that differ.
         """
-        vertices, forces = np.asarray(vertices, dtype=np.int64), np.asarray(forces, dtype=np.float64)
+        vertices, forces = np.asarray(vertices), np.asarray(forces, dtype=np.float64)
+        if vertices.size and vertices.dtype.kind not in "iu":
+            raise ValueError(f"vertices are {vertices.dtype}; they must be whole numbers")
+        vertices = vertices.astype(np.int64)
         if vertices.ndim != 1 or forces.shape != (len(vertices), 3):
             raise ValueError(f"{vertices.shape} vertices and {forces.shape} forces; they must be (k,) and (k, 3)")
         scripted = self.model.assembly.scripted

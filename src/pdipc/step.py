@@ -19,6 +19,7 @@ from pdipc.forces import Loads
 from pdipc.model import Model, State
 from pdipc.parallel import Graph, Reducer
 from pdipc.precision import Real
+from pdipc.witness import find_intersections
 
 RESTRUCTURE_EVERY = 32  # steps between rebuilds of the culling's trees
 REBOUND_ITERATIONS, REBOUND_TOLERANCE = 200, 1e-5  # of the local-global iterations for restitution: most, and relative motion
@@ -30,7 +31,7 @@ RUNNING, CONVERGED, CAPPED, OUT_OF_TIME, OVERFLOW, NOT_FINITE = (wp.constant(cod
 STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND = (wp.constant(place) for place in range(5))
 COUNTS = 5
 # What a step reports after its counts, in one array that the host reads once: iterations, residual, gap, then the stages' times.
-LOCAL_GLOBAL, LINEAR, RESIDUAL, GAP, TIMES = (wp.constant(place) for place in range(COUNTS, COUNTS + 5))
+LOCAL_GLOBAL, LINEAR, RESIDUAL, GAP, FOREIGN, TIMES = (wp.constant(place) for place in range(COUNTS, COUNTS + 6))
 
 # The step is one graph, so its stages are timed where it runs.
 _CLOCK = """
@@ -74,6 +75,19 @@ class StepResult:
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def compare(
+        first: int,
+        x_start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        foreign_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a step starts anywhere but where the last one ended."""
+        i = first + wp.tid()
+        for axis in range(3):
+            if x_start[i][axis] != x[i][axis]:
+                foreign_out[0] = 1
 
     @wp.kernel(module=module)
     def predict(
@@ -247,6 +261,7 @@ def kernels(real: Real) -> SimpleNamespace:
         linear: wp.array(dtype=wp.int32),
         residual: wp.array(dtype=scalar),
         closest: wp.array(dtype=scalar),
+        foreign: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wp.float64),
         report_out: wp.array(dtype=wp.float64),
     ):
@@ -255,6 +270,7 @@ def kernels(real: Real) -> SimpleNamespace:
         report_out[LOCAL_GLOBAL] = wp.float64(local_global[0])
         report_out[LINEAR] = wp.float64(linear[0])
         report_out[RESIDUAL] = wp.float64(residual[0])
+        report_out[FOREIGN] = wp.float64(foreign[0])
         report_out[GAP] = wp.float64(wp.inf)
         if count[BARRIERS] > 0:
             report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))
@@ -301,13 +317,13 @@ class Work:
             return wp.zeros(count, dtype=dtype, device=device.warp)
 
         self.x_start, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3)
-        self.x, self.v, self.a = zeros(vec3), zeros(vec3), zeros(vec3)
+        self.x, self.v, self.a = model.initial_state().positions, zeros(vec3), zeros(vec3)
         self.x_tilde, self.z = zeros(vec3), zeros(vec3)
         self.target, self.loads = zeros(vec3), Loads(device, real, model.external)
         self.acceleration = self.loads.acceleration
         self.force, self.rhs, self.increment = zeros(vec3), zeros(vec3), zeros(vec3)
         self.moved, self.residual, self.committed = zeros(scalar), zeros(scalar, 1), zeros(scalar, 1)
-        self.count, self.going = zeros(wp.int32, COUNTS), zeros(wp.int32, 1)
+        self.count, self.going, self.foreign = zeros(wp.int32, COUNTS), zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(STAGES) + 2)
         self.report = zeros(wp.float64, TIMES + len(STAGES))
         self.largest = Reducer(device, real, n)
@@ -451,8 +467,8 @@ class Work:
         inputs = [self.x_start, moved_to, h, self.v_start, self.a_start, self.v, self.a]
         model.device.launch(k.finish, model.vertex_count, inputs)
         self._mark("misc")
-        numbers = [self.count, self.inner.done, model.solver.iterations, self.residual, self.pairs.closest, self.clock]
-        model.device.launch_serial(k.report, [*numbers, self.report])
+        numbers = [self.count, self.inner.done, model.solver.iterations, self.residual, self.pairs.closest, self.foreign]
+        model.device.launch_serial(k.report, [*numbers, self.clock, self.report])
 
     def _rebound(self) -> None:
         model, rebound = self.model, self.restitution
@@ -488,8 +504,14 @@ def step(
     every outer iteration's committed motion, (n,) vec3 on the device, for witnesses and certificates.
     into: whose arrays receive the new state, so that nothing is allocated; it may be `state`. Where None the new state gets
     arrays of its own, and `state` stays as it is.
+
+    Raises ValueError for a state of another model, and for one that intersects: positions that the last step with `work` did not
+    end at are judged by the witness.
     """
     work = work or Work(model)
+    _belongs(model, state, work)
+    work.foreign.zero_()
+    model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
     work.set_scripted(state, state.time + model.settings.time_step)
     if state.step % RESTRUCTURE_EVERY == 0:
         work.candidates.restructure(state.positions)
@@ -512,6 +534,8 @@ def step(
             break
         if not work.grow():  # a list was full: with more room, the step is taken again
             raise AssertionError("a list overflowed that had room")
+    if report[FOREIGN]:
+        _judge(model, state, work)
     if observe is not None:
         for motion in motions:
             observe(*motion)
@@ -542,3 +566,27 @@ def step(
         smallest_gap=report[GAP],
         milliseconds=dict(zip(STAGES, report[TIMES:], strict=True)),
     )
+
+
+def _belongs(model: Model, state: State, work: Work) -> None:
+    if work.model is not model:
+        raise ValueError("work was made for another model; make one with Work(model)")
+    for name in ("positions", "velocities", "accelerations"):
+        array: wp.array = getattr(state, name)
+        if array.shape != work.x.shape or not wp.types.types_equal(array.dtype, work.x.dtype):
+            raise ValueError(
+                f"the state's {name} are {array.shape} of {array.numpy().dtype}; those of the model are {work.x.shape} of "
+                f"{model.real.name}"
+            )
+
+
+def _judge(model: Model, state: State, work: Work) -> None:
+    assembly, triangles = model.assembly, model.triangles
+    pairs = find_intersections(state.positions.numpy(), triangles, assembly.obstacle)
+    if len(pairs):
+        work.x.fill_(wp.nan)  # so that it is judged again
+        names = [assembly.bodies[body].name for body in assembly.body_of_vertex[triangles[pairs[0]][:, 0]]]
+        raise ValueError(
+            f"the state at t = {state.time:g} s has {len(pairs)} pairs of triangles that intersect, such as triangle {pairs[0][0]} "
+            f'of "{names[0]}" and {pairs[0][1]} of "{names[1]}"; a step starts from a state without intersections'
+        )

@@ -4,6 +4,7 @@ What the browser does is only noted by callbacks; one loop, in the caller's thre
 its message, as it does anywhere else, and no state is shared between threads but plain values.
 """
 
+import socket
 import time
 from collections import deque
 from collections.abc import Callable
@@ -35,6 +36,7 @@ class View:
 
     triangles: (m, 3); body_of_vertex: (n,); kinds: "solid", "cloth" or "obstacle" a body; positions: (n, 3), m.
     The page is served at `url` as long as the object lives; if the port is taken, the next free one is used.
+    Raises OSError for a host that this machine cannot serve at.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class View:
     ):
         import viser
 
+        _must_be_here(host)
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.server.scene.set_up_direction("+y")
@@ -72,6 +75,16 @@ class View:
         with self.server.atomic():
             for mesh, vertices in zip(self.meshes, self.vertices, strict=True):
                 mesh.vertices = positions[vertices].astype(np.float32)
+
+
+def _must_be_here(host: str) -> None:
+    """viser would wait for ever for a server that cannot start."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise OSError(f'host "{host}" is no address of this machine ({error.strerror}); it must be like localhost') from error
 
 
 class Playback:

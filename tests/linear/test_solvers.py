@@ -10,7 +10,7 @@ import warp as wp
 
 from linear import systems
 from linear.contacts import CoupledContact, ScalarContact
-from pdipc.linear import SOLVERS, System, make_solver
+from pdipc.linear import SOLVERS, System, kernels, make_solver
 from pdipc.parallel import Device
 from pdipc.precision import real
 
@@ -144,12 +144,33 @@ def test_iterations_are_capped_and_residual_is_honest():
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", [name for name in SOLVERS if name != "direct"])
-def test_what_is_no_number_is_not_swallowed(name, precision):
-    """A force that is not a number must reach the solution, where the step notices it; a zero increment would pass for rest."""
+@pytest.mark.parametrize("part", [np.nan, 0.75])
+def test_what_is_no_number_is_not_swallowed(name, precision, part):
+    """A force that is not a number must reach the solution, where the step notices it, and so must one whose square is none: a
+    zero increment would pass for rest.
+    """
     system, start, b, _, _ = case("soft cloth", None, 0, Device("cpu"), real(precision))
-    b[np.argmax(meshes()["soft cloth"][0][:, 0]), 1] = np.nan
+    force = float(np.finfo(precision).max) ** part
+    b[np.argmax(meshes()["soft cloth"][0][:, 0]), 1] = force
     x = solve(make_solver(name, system, tolerance=0.1, max_iterations=3), start, b)
-    assert np.isnan(x).any()
+    assert np.isnan(x).any() if np.isnan(part) else not np.abs(x).max() < 1e-6 * force
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("stiffness", [1.0, 1e6, 1e15, 1e20])
+def test_blocks_of_stiff_contacts_have_a_positive_inverse(precision, stiffness):
+    """Blocks 1 + stiffness n n^T, whose determinant is beyond float32, and in which rounding hides the 1."""
+    number = real(precision)
+    invert = kernels.functions(number).invert
+    for normal in np.random.default_rng(0).standard_normal((50, 3)):
+        normal /= np.linalg.norm(normal)
+        block = np.eye(3) + stiffness * np.outer(normal, normal)
+        inverse = np.array(invert(number.mat33(*block.astype(precision).ravel().tolist())), dtype=np.float64).reshape(3, 3)
+        assert np.array_equal(inverse, inverse.T)
+        assert np.linalg.eigvalsh(inverse).min() > 0.0
+        assert normal @ inverse @ normal == pytest.approx(1.0 / (1.0 + stiffness), rel=0.5)
+        if stiffness * np.finfo(precision).eps < 1e-6:
+            assert inverse == pytest.approx(np.linalg.inv(block), abs=1e-3)
 
 
 def test_nothing_to_solve():

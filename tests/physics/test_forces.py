@@ -66,6 +66,8 @@ def test_a_pull_that_is_let_go_no_longer_acts():
         ([-1], [[0.0, 1.0, 0.0]], "there is no vertex -1"),
         ([1000], [[0.0, 1.0, 0.0]], "there is no vertex 1000"),
         ([27], [[0.0, 1.0, 0.0]], "vertex 27 follows a script"),
+        ([0.5], [[0.0, 1.0, 0.0]], "vertices are float64; they must be whole numbers"),
+        (["0"], [[0.0, 1.0, 0.0]], "they must be whole numbers"),
     ],
 )
 def test_bad_pulls_are_refused(vertices, forces, told):

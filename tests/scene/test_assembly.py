@@ -156,11 +156,31 @@ def test_a_vertex_force_is_shared_and_wind_is_felt_by_the_named():
     assert np.array_equal(whole.winds[0].triangles, whole.bodies[1].triangles)
 
 
+FLOOR = Obstacle(name="o", mesh=generators.Plane(size=1), translation=(0, -1, 0))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"attachments": [Attachment(bodies=("a", "z"), within=1)]}, r'attachments\[0\]: there is no body "z"; there are: a'),
         ({"forces": [Wind(velocity=(1, 0, 0), bodies=["z"])]}, r'forces\[0\]: there is no body "z"'),
+        (
+            {"attachments": [Attachment(bodies=("a", "a"), pairs=[(0, 2**32 + 1)])]},
+            r"attachments\[0\]: vertex 4294967297 is out",
+        ),
+        ({"forces": [Wind(velocity=(1, 0, 0), bodies=["a", "a"])]}, r"forces\[0\]: names a body more than once: a, a"),
+        (
+            {"obstacles": [FLOOR], "forces": [Wind(velocity=(1, 0, 0), bodies=["o"])]},
+            r'forces\[0\]: obstacle "o" feels no force',
+        ),
+        (
+            {"obstacles": [FLOOR], "forces": [VertexForce(body="o", select=Selection(all=True), force=(0, 1, 0))]},
+            r'forces\[0\]: obstacle "o" feels no force; it must be a body',
+        ),
+        (
+            {"bodies": [Cloth(name="a", mesh=Arrays(vertices=np.eye(3), triangles=[[2**32, 1, 2]]))]},
+            r'body "a": mesh: triangles\[0\] = \[4294967296, 1, 2\] is out of range',
+        ),
         ({"bodies": [Solid(name="s", mesh=GRID)]}, r'body "s": a solid needs tetrahedra, its mesh has triangles only'),
     ],
 )

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from pdipc.model import build
 from pdipc.scene import generators
 from pdipc.scene.assembly import assemble
 from pdipc.scene.check import (
+    _fans,
     check,
     edge_edge_distances,
     point_segment_distances,
@@ -134,6 +136,49 @@ def test_bad_triangles(triangles, message):
     assert message in text
 
 
+def fan(center: int, first: int, closed: bool) -> list[list[int]]:
+    """Four triangles around a vertex, on a rim of the vertices from `first` on."""
+    rim = [first + k for k in range(4 if closed else 5)]
+    return [[center, rim[k], rim[(k + 1) % len(rim)]] for k in range(4)]
+
+
+@pytest.mark.parametrize("kind", [Solid, Cloth, Obstacle])
+def test_vertices_that_join_fans_of_triangles(kind):
+    """Three cubes in a chain that only their corners hold together."""
+    cube = generators.Box(size=(1, 1, 1), cells=(1, 1, 1)).mesh()
+    vertices, number = np.unique(np.concatenate([cube.vertices + k for k in range(3)]), axis=0, return_inverse=True)
+    tets = np.concatenate([number.ravel()[cube.tets + 8 * k] for k in range(3)])
+    chain = kind(name="c", mesh=Arrays(vertices=vertices, tets=tets))
+    if kind is Obstacle:
+        text, label = findings(Cloth(name="far", mesh=GRID, translation=(9, 9, 9)), obstacles=[chain]), "obstacle"
+    else:
+        text, label = findings(chain), "body"
+    assert text == (
+        f'{label} "c": 2 vertices of its surface join fans of triangles that share no edge there: '
+        "vertex 7 at (0.5, 0.5, 0.5) m joins 2, vertex 14 at (1.5, 1.5, 1.5) m joins 2; "
+        "the surface must be a manifold: give each fan a vertex of its own, with a gap between them"
+    )
+
+
+@pytest.mark.parametrize(
+    ("triangles", "fans"),
+    [
+        (fan(0, 1, True), 1),
+        (fan(0, 1, False), 1),
+        (fan(0, 1, True) + fan(0, 5, True), 2),
+        (fan(0, 1, True) + fan(0, 5, False), 2),
+        (fan(0, 1, False) + fan(0, 6, False) + [[0, 11, 12]], 3),
+        ([[0, 1, 2], [2, 1, 3], [2, 4, 0]], 1),
+        ([[0, 1, 2], [0, 2, 3], [4, 2, 0]], 1),  # an edge of three triangles, which is refused for that
+        ([triangle[::-1] for triangle in fan(0, 1, True)[:2]] + fan(0, 1, True)[2:], 1),  # of two orientations
+    ],
+)
+def test_counting_fans(triangles, fans):
+    vertices, counts = _fans(np.array(triangles))
+    assert np.array_equal(vertices, np.unique(triangles))
+    assert counts.tolist() == [fans] + [1] * (len(counts) - 1)
+
+
 def test_selections_of_nothing():
     cloth = Cloth(name="c", mesh=GRID, pins=[Pin(select=NOWHERE)])
     force = VertexForce(body="c", select=NOWHERE, force=(1, 0, 0))
@@ -223,12 +268,42 @@ def test_everything_is_found_at_once_though_a_mesh_and_names_are_missing():
         assemble(scene)
 
 
+@pytest.mark.parametrize("scene", ["thin_rod", {"bodies": []}, None])
+def test_what_is_no_scene(scene):
+    with pytest.raises(TypeError, match=f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use"):
+        check(scene)
+
+
 def test_refuse_says_everything_in_one_error():
     scene = Scene(bodies=[Solid(name="a", mesh=BOX), Cloth(name="b", mesh=GRID, pins=[Pin(select=NOWHERE)])])
     with pytest.raises(SceneError, match="cannot be simulated, 2 things to put right:") as caught:
-        refuse(scene)
+        refuse(scene, assemble(scene), "float64")
     assert len(str(caught.value).splitlines()) == 3
-    refuse(Scene(bodies=[Solid(name="a", mesh=BOX)]))
+    scene = Scene(bodies=[Solid(name="a", mesh=BOX)])
+    refuse(scene, assemble(scene), "float64")
+
+
+@pytest.mark.parametrize(
+    ("method", "simulation", "found"),
+    [
+        ("barrier", {"linear_solver": "a-jacobi"}, '"a-jacobi" cannot take the contacts of contact.method = "barrier"'),
+        ("barrier", {"solver_drop": 0.01}, 'is 0.01, but only a-jacobi has A-products; the solver is "auto"'),
+        ("paper", {"linear_solver": "pcg", "solver_drop": 0.01}, 'only a-jacobi has A-products; the solver is "pcg"'),
+        ("paper", {"linear_solver": "auto", "solver_drop": 0.01}, ""),
+        ("paper", {"linear_solver": "a-jacobi"}, ""),
+    ],
+)
+def test_settings_that_do_not_go_together(method, simulation, found):
+    """The check finds what a run refuses, beside what else is wrong."""
+    scene = Scene(
+        bodies=[Solid(name="a", mesh=BOX, pins=[Pin(select=NOWHERE)])], simulation=simulation, contact={"method": method}
+    )
+    text = "\n".join(map(str, check(scene)))
+    assert found in text and "selects no vertex" in text
+    assert len(text.splitlines()) == 1 + bool(found)
+    with pytest.raises(SceneError) as caught:
+        build(scene, "cpu")
+    assert found in str(caught.value)
 
 
 # --- the distances that the check uses ---

@@ -25,6 +25,10 @@ mesh = { shape = "sphere", cells = 4 }
     [
         ("titel = 'x'", r'titel = "x": unknown key; did you mean "title"\?'),
         ("[simulation]\ntime_step = 0", r"simulation.time_step = 0: must be greater than 0 \(Length h of a step, s"),
+        (
+            "[simulation]\nlinear_iterations = 10000000000",
+            r"linear_iterations = 10000000000: must be less than or equal to 100000",
+        ),
         ("[simulation]\nlinear_solver = 'lu'", r'linear_solver = "lu": must be .*pcg'),
         ("[contact]\ntruncation = 'none'", r'contact.truncation = "none": must be .auto., .per_vertex. or .global.'),
         ("[[bodies]]\nname = 'a'\nmesh = 'a.obj'", r'bodies\[1\] \("a"\): needs kind = "solid" or "cloth"$'),
@@ -90,6 +94,11 @@ def test_mesh_paths_are_relative_to_the_file(tmp_path):
     scene = load_scene(tmp_path / "scene.toml")
     assert scene.bodies[0].mesh == str(tmp_path / "one.npz")
     assert len(assemble(scene).tets) == 1
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD, encoding="utf-8-sig")
+    assert load_scene(tmp_path / "scene.toml").bodies[0].name == "ball"
 
 
 def test_a_scene_survives_json(tmp_path):

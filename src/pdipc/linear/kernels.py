@@ -20,6 +20,7 @@ from pdipc.parallel import Device
 from pdipc.precision import Real
 
 BLOCK = 256  # vertices whose numbers are added up together
+HIDDEN = 16.0  # unit roundoffs of the trace of a 3x3 block: what its rounding errors may hide, and more
 
 # Four sums side by side, because an addition has to wait for the one before.
 _SUM_SLOTS = """
@@ -70,6 +71,7 @@ def functions(real: Real) -> SimpleNamespace:
     """Warp functions on one vertex, and the two halves of a sum."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     row_product = rows.functions(real).row_product
+    hidden_part = HIDDEN * real.unit_roundoff
 
     @wp.func
     def precondition(i: int, inverse: wp.array(dtype=scalar), inverse_block: wp.array(dtype=mat33), r: vec3):
@@ -78,6 +80,26 @@ def functions(real: Real) -> SimpleNamespace:
         if factor < scalar(0.0):
             return inverse_block[i] * r
         return factor * r
+
+    @wp.func
+    def invert(a: mat33):
+        """a^-1 of a symmetric, positive semidefinite block, by its L D L^T.
+
+        A barrier at a tiny gap is so stiff across it that rounding hides what a is along it, and that the determinant of a
+        overflows in float32. What may be hidden is added, so that the inverse is positive definite whatever a is.
+        """
+        hidden = scalar(hidden_part) * wp.trace(a)
+        d0 = a[0, 0] + hidden
+        l10 = a[1, 0] / d0
+        l20 = a[2, 0] / d0
+        d1 = a[1, 1] + hidden - l10 * a[1, 0]
+        l21 = (a[2, 1] - l20 * a[1, 0]) / d1
+        d2 = a[2, 2] + hidden - l20 * a[2, 0] - l21 * l21 * d1
+        # L^-T D^-1 L^-1, whose rows are those of L^-1
+        r0 = vec3(scalar(1.0), scalar(0.0), scalar(0.0))
+        r1 = vec3(-l10, scalar(1.0), scalar(0.0))
+        r2 = vec3(l10 * l21 - l20, -l21, scalar(1.0))
+        return wp.outer(r0, r0) / d0 + wp.outer(r1, r1) / d1 + wp.outer(r2, r2) / d2
 
     @wp.func
     def store_sum(total: scalar, worker: int, partial_out: wp.array(dtype=scalar)):
@@ -115,7 +137,7 @@ def functions(real: Real) -> SimpleNamespace:
         if first_out[0] > scalar(0.0):
             residual = norm / first_out[0]
         condition_out[0] = wp.where(residual > tolerance, 1, 0)
-        if wp.isnan(gamma):  # one iteration carries it into x, where the step sees it
+        if not wp.isfinite(gamma):  # one iteration carries it into x, where the step sees it
             residual = gamma
             condition_out[0] = 1
         residual_out[0] = residual
@@ -147,6 +169,7 @@ def kernels(real: Real) -> SimpleNamespace:
     """Kernels on single vertices."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
+    invert = functions(real).invert
 
     @wp.kernel(module=module)
     def clear(first: int, values_out: wp.array(dtype=vec3)):
@@ -181,7 +204,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     inverse = scalar(-1.0)
                     for k in range(3):
                         block[k, k] += total
-                    inverse_block_out[i] = wp.inverse(block)
+                    inverse_block_out[i] = invert(block)
         total_out[i] = total
         inverse_out[i] = inverse
 

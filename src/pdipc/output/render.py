@@ -10,6 +10,7 @@ from pdipc.output.results import Run, RunError
 
 STILL = (".png", ".jpg")
 MOVING = (".gif", ".mp4")
+LARGEST = 8192  # pixels of a side: what every driver draws
 PALETTE = ("#3f87c5", "#f0803c", "#4fae7b", "#e2b33c", "#9a72c0", "#dc5f7c", "#3fb0b5", "#a9825a")
 OBSTACLE = "#c4c9d0"
 OPACITY = 0.3  # of obstacles above the bodies, which would hide them

@@ -233,8 +233,12 @@ def assemble(scene: Scene) -> Assembly:
 def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
     """What `assemble` makes, of all that can be read and is known, and a line for each thing that is not.
 
-    None where not a single body can be read.
+    None where not a single body can be read. Raises TypeError for what is no `Scene`.
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use pdipc.Scene(**tables) or pdipc.load_scene(path)"
+        )
     problems: list[str] = []
     unread: set[str] = set()  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
@@ -341,6 +345,13 @@ def _body(assembly: Assembly, name: str, where: str) -> AssembledBody:
     raise SceneError(f'{where}: there is no body "{name}"; there are: {", ".join(body.name for body in assembly.bodies)}')
 
 
+def _pushed(assembly: Assembly, name: str, where: str) -> AssembledBody:
+    body = _body(assembly, name, where)
+    if body.kinematic:
+        raise SceneError(f"{where}: {_label(body)} feels no force; it must be a body")
+    return body
+
+
 def _select(assembly: Assembly, body: AssembledBody, select: Selection, where: str) -> np.ndarray:
     """(k,) int32, ascending; may be empty: the check reports that."""
     points = assembly.positions[body.first : body.last]
@@ -372,9 +383,9 @@ def _label(body: AssembledBody) -> str:
 def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
     a, b = (_body(assembly, name, where) for name in table.bodies)
     if table.pairs is not None:
+        for side, body in enumerate((a, b)):
+            _in_range(body, [pair[side] for pair in table.pairs], where)
         pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
-        _in_range(a, pairs[:, 0].tolist(), where)
-        _in_range(b, pairs[:, 1].tolist(), where)
     else:
         near = cKDTree(assembly.positions[b.first : b.last])
         distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
@@ -391,11 +402,13 @@ def _force(assembly: Assembly, table: Wind | VertexForce, where: str) -> None:
     end = np.inf if table.end is None else table.end
     if isinstance(table, Wind):
         names = [body.name for body in assembly.bodies if not body.kinematic] if table.bodies is None else table.bodies
-        triangles = np.concatenate([_body(assembly, name, where).triangles for name in names])
+        if len(set(names)) < len(names):
+            raise SceneError(f"{where}: names a body more than once: {', '.join(names)}")
+        triangles = np.concatenate([_pushed(assembly, name, where).triangles for name in names])
         wind = AssembledWind(triangles, np.array(table.velocity), table.air_density, table.drag, table.start, end)
         assembly.winds.append(wind)
     else:
-        vertices = _select(assembly, _body(assembly, table.body, where), table.select, where)
+        vertices = _select(assembly, _pushed(assembly, table.body, where), table.select, where)
         share = np.array(table.force) / max(1, len(vertices))
         where += f".select = {table.select}"
         assembly.forces.append(AssembledForce(where, table.body, vertices, share, table.start, end))

@@ -14,6 +14,7 @@ from pdipc.scene.errors import SceneError
 from pdipc.scene.schema import Scene
 from pdipc.witness import find_intersections
 
+LISTED = 5  # vertices that a finding names
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
 SEPARATION_ULPS = 100  # a minimum separation of fewer roundings of a coordinate is no protection
 
@@ -40,7 +41,7 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     if isinstance(scene, Assembly):
         return _check(scene, precision or "float64")
     assembly, problems = gather(scene)
-    findings = []
+    findings = [*_settings(scene)]
     for problem in problems:
         where, _, found = problem.partition(": ")
         findings.append(Finding(where, found))
@@ -50,12 +51,24 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     return findings + _check(assembly, precision, complete=not problems)
 
 
-def refuse(scene: Scene | Assembly, precision: str | None = None) -> None:
-    """Raises SceneError with all findings of `check` where there are any."""
-    findings = check(scene, precision)
+def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
+    """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`."""
+    findings = [*_settings(scene), *check(assembly, precision)]
     if findings:
         found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
         raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
+
+
+def _settings(scene: Scene) -> Iterator[Finding]:
+    """Settings of the solver that do not go together."""
+    method, solver, drop = scene.contact.method, scene.simulation.linear_solver, scene.simulation.solver_drop
+    aggregates = solver == "a-jacobi" or (solver == "auto" and method == "paper")
+    if aggregates and method == "barrier":
+        found = f'"{solver}" cannot take the contacts of contact.method = "{method}"'
+        yield Finding("simulation.linear_solver", found, "take another solver, such as matrix-powers, or the paper's contact")
+    if drop > 0.0 and not aggregates:
+        found = f'is {drop:g}, but only a-jacobi has A-products; the solver is "{solver}"'
+        yield Finding("simulation.solver_drop", found, "leave it out")
 
 
 def smallest_separation(assembly: Assembly, precision: str) -> float:
@@ -131,10 +144,35 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
         edge = (edges[crowded[0]] - first).tolist()
         found = f"{len(crowded)} edges of its surface belong to more than two triangles, first {edge}"
         yield Finding(label, found, "the surface must be a manifold: split it there")
+    vertices, fans = _fans(body.triangles)
+    joints = np.flatnonzero(fans > 1)
+    if len(joints):
+        listed = [
+            f"vertex {vertices[k] - first} at {_at(assembly.positions[vertices[k]])} m joins {fans[k]}" for k in joints[:LISTED]
+        ]
+        if len(joints) > LISTED:
+            listed.append("...")
+        found = f"{len(joints)} vertices of its surface join fans of triangles that share no edge there: {', '.join(listed)}"
+        yield Finding(
+            label, found, "the surface must be a manifold: give each fan a vertex of its own, with a gap between them"
+        )
     unused = np.setdiff1d(np.arange(first, body.last), elements)
     if len(unused):
         found = f"{len(unused)} vertices belong to no {kind[:-1]}, first vertex {unused[0] - first}"
         yield Finding(label, found, "remove them")
+
+
+def _fans(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of triangles (m, 3), and how many fans meet in each: triangles around it that are connected by edges."""
+    corners = np.arange(triangles.size).reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    sides = triangles.reshape(-1)[corners]
+    _, edge = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    # corners of triangles are connected to the ends of edges, and so to the corners at the same vertex across an edge
+    ends = triangles.size + 2 * edge.reshape(-1, 1) + np.argsort(sides, axis=1)
+    graph = scipy.sparse.coo_matrix((np.ones(corners.size), (corners.ravel(), ends.ravel())), shape=2 * (3 * triangles.size,))
+    _, fan = connected_components(graph, directed=False)
+    _, first = np.unique(fan[: triangles.size], return_index=True)
+    return np.unique(triangles.reshape(-1)[first], return_counts=True)
 
 
 def _selections(assembly: Assembly) -> Iterator[Finding]:

@@ -33,9 +33,9 @@ def load_scene(path: str | Path) -> Scene:
         raise SceneError(f'"{path}": there is no such file; {hint}bundled scenes: {", ".join(bundled_scenes())}')
     try:
         if file.suffix == ".json":
-            data = json.loads(file.read_text(encoding="utf-8"))
+            data = json.loads(file.read_text(encoding="utf-8-sig"))  # some editors begin a file with a mark
         elif file.suffix == ".toml":
-            data = tomllib.loads(file.read_text(encoding="utf-8"))
+            data = tomllib.loads(file.read_text(encoding="utf-8-sig"))
         else:
             raise SceneError(f'"{file}": a scene file ends in .toml or .json')
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -67,16 +67,19 @@ class Simulation(Table):
         "The default is what is customary for IPC at h = 1/100 s; for comparisons with exact solutions take 1e-5 or less.",
     )
     max_outer: int = Field(
-        default=50, ge=1, description="Most outer iterations of a step; a step that ends here is feasible, and says so."
+        default=50,
+        ge=1,
+        le=10**6,
+        description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
     )
-    inner_iterations: int = Field(default=30, ge=1, description="Most local-global iterations in an outer iteration.")
+    inner_iterations: int = Field(default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration.")
     linear_solver: Literal[
         "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
     ] = Field(
         default="auto",
         description='Solver of the global step; "auto": two-level (on CUDA pcg), with the paper\'s contact a-jacobi.',
     )
-    linear_iterations: int = Field(default=20, ge=1, description="Most iterations of a global solve.")
+    linear_iterations: int = Field(default=20, ge=1, le=10**5, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
@@ -134,8 +137,8 @@ class Contact(Table):
 
 def _rows(dtype: type, width: int) -> BeforeValidator:
     def read(value: Any) -> np.ndarray:
-        array = np.array(value, dtype=None if dtype is np.int32 else dtype)
-        if array.size and dtype is np.int32 and array.dtype.kind not in "iu":
+        array = np.array(value, dtype=None if dtype is np.int64 else dtype)
+        if array.size and dtype is np.int64 and array.dtype.kind not in "iu":
             raise ValueError("must be whole numbers")
         if array.size and (array.ndim != 2 or array.shape[1] != width):
             raise ValueError(f"has the shape {array.shape}; must be (n, {width})")
@@ -146,8 +149,8 @@ def _rows(dtype: type, width: int) -> BeforeValidator:
 
 _AS_LIST = PlainSerializer(lambda array: array.tolist(), return_type=list)
 Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST]
-Triangles = Annotated[np.ndarray, _rows(np.int32, 3), _AS_LIST]
-Tets = Annotated[np.ndarray, _rows(np.int32, 4), _AS_LIST]
+Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST]
+Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST]
 
 
 class Arrays(Table):

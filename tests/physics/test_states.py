@@ -1,0 +1,91 @@
+"""States that no step has made: what a user may write into one, and what is refused."""
+
+import copy
+
+import numpy as np
+import pytest
+
+import pdipc
+from pdipc.step import Work, step
+from physics.scenes import cloth, floor, scene, solid
+
+
+def simulation(**settings):
+    bodies = [solid("block", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 0.1, 0)), cloth("sheet", [0.3, 0.3], [6, 6], at=(0, 0.3, 0))]
+    made = pdipc.Simulation(scene(bodies, [floor(2.0)], contact={"activation_distance": 1e-3}, **settings), "cpu")
+    for _ in range(3):
+        made.step()
+    return made
+
+
+def write(made, name, change):
+    array = getattr(made.state, name)
+    values = array.numpy().copy()
+    change(values)
+    array.assign(values)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda x: x[:27].__isub__([0.0, 0.1, 0.0]),
+            'intersect, such as triangle .* of "block" and .* of "floor"; a step starts',
+        ),
+        (lambda x: x[3].fill(np.nan), r"positions\[3\] = .* is not finite"),
+    ],
+)
+def test_positions_that_intersect_or_are_none_are_refused(change, told):
+    made = simulation()
+    write(made, "positions", change)
+    given, seen = made.state.copy(), []
+    made.observe = lambda x, x_end: seen.append(x)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=told):
+            made.step()
+    assert not seen
+    assert np.array_equal(made.positions, given.positions.numpy(), equal_nan=True) and made.state.step == given.step
+
+
+def test_a_body_may_be_put_elsewhere():
+    made = simulation()
+    write(made, "positions", lambda x: x[:27].__iadd__([0.0, 0.5, 0.0]))
+    write(made, "velocities", lambda v: v[:27].__imul__(0.0))
+    assert made.step().converged
+    assert made.positions[:27, 1].min() > 0.5
+
+
+@pytest.mark.parametrize("name", ["velocities", "accelerations"])
+def test_velocities_that_are_no_numbers_are_told_and_gone(name):
+    made = simulation()
+    write(made, name, lambda values: values[3].fill(np.nan))
+    before = made.positions
+    assert "not finite" in made.step().message
+    assert np.array_equal(made.positions, before)
+    made.step()
+    assert made.step().converged
+
+
+def test_an_earlier_state_gives_the_same_bits():
+    made = simulation()
+    kept = copy.deepcopy(made.state)
+    ends = []
+    for _ in range(2):
+        made.state = kept.copy()
+        for _ in range(20):
+            made.step()
+        ends.append(made.positions)
+    assert np.array_equal(*ends)
+    assert kept.step == 3
+
+
+def test_states_and_buffers_of_other_models_are_refused():
+    made, single = simulation(), simulation(precision="float32")
+    other = pdipc.Simulation(scene([cloth("sheet", [0.3, 0.3], [3, 3])]), "cpu")
+    with pytest.raises(ValueError, match="work was made for another model"):
+        step(made.model, made.state, other.work)
+    with pytest.raises(ValueError, match=r"the state's positions are \(16,\) of .*; those of the model are \(80,\)"):
+        step(made.model, other.state, made.work)
+    with pytest.raises(ValueError, match=r"are \(80,\) of float32; those of the model are \(80,\) of float64"):
+        step(made.model, single.state, made.work)
+    assert step(made.model, made.state, Work(made.model)).converged
