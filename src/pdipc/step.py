@@ -16,6 +16,7 @@ from pdipc.contact.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.contact.truncation import Truncation
 from pdipc.energy_rate import EnergyRate
 from pdipc.forces import Loads
+from pdipc.linear import Translations
 from pdipc.model import Model, State
 from pdipc.parallel import Graph, Reducer
 from pdipc.precision import Real
@@ -352,6 +353,8 @@ class Work:
             masses = (model.mass, model.free, model.body_mass, model.rigidity)
             self.restitution = Restitution(device, real, self.pairs, *masses, settings.restitution, settings.time_step)
             self.parting = Anderson(device, real, n, 0.0, REBOUND_TOLERANCE)
+        # the paper starts its solves from rest
+        self.translations = None if self.as_printed or model.solver.moves_bodies else Translations(model.solver.system)
         self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
         self._graphs: dict[str, Graph] = {}
         self._graphs_of: tuple[int, int] = (-1, -1)
@@ -451,8 +454,14 @@ class Work:
         device.launch(k.inertia, model.vertex_count, inputs)
         model.projector.add_forces(self.x_tilde, self.rhs, self.force)
         self.pairs.linearize(self.x, self.x_tilde, self.x_start, self.rhs)
-        model.solver.solve(self.increment, self.rhs, self.pairs, prepared=self.as_printed)
+        self._solve()
         self.inner.advance(self.x_tilde, self.increment, model.free)
+
+    def _solve(self) -> None:
+        """Line 10: K increment = rhs."""
+        if self.translations is not None:
+            self.translations.start(self.increment, self.rhs, self.pairs)
+        self.model.solver.solve(self.increment, self.rhs, self.pairs, prepared=self.as_printed)
 
     def finish(self) -> None:
         """Line 18; with restitution, velocities are those that bodies part with."""
@@ -480,7 +489,7 @@ class Work:
             rebound.inertia(self.x, self.force, self.increment)
             model.projector.add_forces(rebound.x_now, self.rhs, self.force)
             rebound.linearize(self.x_start, self.rhs)
-            model.solver.solve(self.increment, self.rhs, self.pairs)
+            self._solve()
             self.parting.advance(rebound.x_now, self.increment, model.free)
 
         model.device.loop(self.parting.going, local_global)

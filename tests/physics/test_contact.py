@@ -76,7 +76,7 @@ def test_a_gap_that_rounds_to_less_than_nothing_still_pushes():
     contact = {"minimum_separation": 2e-3, "activation_distance": 5e-3}
     made = watched(scene([{"name": "two", "kind": "cloth", "mesh": mesh, **place}], contact=contact, precision="float32"))
     pressed = 0
-    for _ in range(3):
+    for _ in range(6):
         result = made.step()
         count = int(made.work.pairs.count.numpy()[0])
         pressed += count

@@ -7,5 +7,6 @@ The matrix A is constant, the same for the three coordinates, and known before t
 from pdipc.linear.solver import Contact, Solver
 from pdipc.linear.solvers import SOLVERS, make_solver
 from pdipc.linear.system import System
+from pdipc.linear.translations import Translations
 
-__all__ = ["SOLVERS", "Contact", "Solver", "System", "make_solver"]
+__all__ = ["SOLVERS", "Contact", "Solver", "System", "Translations", "make_solver"]

@@ -82,6 +82,8 @@ class TwoLevel(pcg.Pcg):
     group: vertices of a group, by default GROUP, more where there would be more than MAX_GROUPS of them.
     """
 
+    moves_bodies = True
+
     def __init__(self, system: System, tolerance: float, max_iterations: int, group: int | None = None):
         super().__init__(system, tolerance, max_iterations)
         label = partition.groups(system.matrix, system.free, group or max(GROUP, int(system.free.sum()) // MAX_GROUPS))

@@ -16,6 +16,7 @@ class Direct(Solver):
     """Sparse Cholesky (cholespy, where it is installed, else SciPy's SuperLU). Runs on the host and cannot be recorded."""
 
     recordable = False
+    moves_bodies = True
 
     def __init__(self, system: System, tolerance: float, max_iterations: int):
         super().__init__(system, tolerance, max_iterations)

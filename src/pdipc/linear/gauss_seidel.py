@@ -69,7 +69,7 @@ class Sor(Solver):
     ) -> None:
         apply = contact.apply if contact is not None else None
         status_kernels = jacobi.kernels(self.real)
-        matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
+        matrix = [*self.system.rows.arguments, self.held, self.inverse, self.inverse_block, b]
         status = [self.first, self.left, self.iterations, self.residual, self.condition]
         if not prepared:
             self.prepare(contact)
@@ -117,7 +117,7 @@ def kernels(real: Real) -> SimpleNamespace:
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
         inverse: wp.array(dtype=scalar),
         inverse_block: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
@@ -129,7 +129,7 @@ def kernels(real: Real) -> SimpleNamespace:
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if inverse[i] != scalar(0.0):
-                r = b[i] - w[i] - diagonal[i] * x[i] - f.row_product(i, offsets, columns, values, x)
+                r = b[i] - w[i] - held[i] * x[i] - f.row_difference(i, offsets, columns, values, x)
                 gamma += wp.dot(r, f.precondition(i, inverse, inverse_block, r))
         f.store_sum(gamma, worker, partial_out)
 
@@ -141,7 +141,7 @@ def kernels(real: Real) -> SimpleNamespace:
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
         inverse: wp.array(dtype=scalar),
         inverse_block: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
@@ -157,7 +157,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(worker * share, wp.min((worker + 1) * share, count)):
             i = vertices[k]
             own = x[i]
-            r = b[i] - w[i] - diagonal[i] * own - f.row_product(i, offsets, columns, values, x)
+            r = b[i] - w[i] - held[i] * own - f.row_difference(i, offsets, columns, values, x)
             u = f.precondition(i, inverse, inverse_block, r)
             gamma += wp.dot(r, u)
             x[i] = own + omega * u

@@ -64,7 +64,7 @@ class Jacobi(Solver):
 
     def sweep(self, source: wp.array, target: wp.array, step: int, b: wp.array, coupled: int = 0) -> None:
         """Launches the sweep number `step` of the current group of sweeps, or with -1 only the residual of `source`."""
-        matrix = [*self.system.rows.arguments, self.total, self.inverse, self.inverse_block, b]
+        matrix = [*self.system.rows.arguments, self.held, self.inverse, self.inverse_block, b]
         self.sums.launch(self._kernels.sweep, [*matrix, *self.weights, step, coupled, self._w, source, target, self.partial])
 
     def solve(
@@ -124,7 +124,7 @@ def kernels(real: Real) -> SimpleNamespace:
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
         inverse: wp.array(dtype=scalar),
         inverse_block: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
@@ -148,7 +148,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if inverse[i] != scalar(0.0):
                 own = x[i]
-                r = b[i] - diagonal[i] * own - f.row_product(i, offsets, columns, values, x)
+                r = b[i] - held[i] * own - f.row_difference(i, offsets, columns, values, x)
                 if coupled != 0:
                     r -= w[i]
                 u = f.precondition(i, inverse, inverse_block, r)

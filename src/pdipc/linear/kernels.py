@@ -70,7 +70,7 @@ class Sums:
 def functions(real: Real) -> SimpleNamespace:
     """Warp functions on one vertex, and the two halves of a sum."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    row_product = rows.functions(real).row_product
+    row_product, row_difference = rows.functions(real).row_product, rows.functions(real).row_difference
     hidden_part = HIDDEN * real.unit_roundoff
 
     @wp.func
@@ -184,19 +184,26 @@ def kernels(real: Real) -> SimpleNamespace:
     def invert_diagonal(
         first: int,
         diagonal: wp.array(dtype=scalar),
+        row_sum: wp.array(dtype=scalar),
         contact_scalar: wp.array(dtype=scalar),
         contact_block: wp.array(dtype=mat33),
         total_out: wp.array(dtype=scalar),
+        held_out: wp.array(dtype=scalar),
         inverse_out: wp.array(dtype=scalar),
         inverse_block_out: wp.array(dtype=mat33),
     ):
-        """total = A_ii + contact scalar; inverse = 1/total, or -1 with the inverse of the 3x3 block; 0 where not free."""
+        """total = A_ii + contact scalar; inverse = 1/total, or -1 with the inverse of the 3x3 block; 0 where not free.
+
+        held = sum_j A_ij + contact scalar: (A x)_i = held x_i + sum_j A_ij (x_j - x_i).
+        """
         i = first + wp.tid()
         total = diagonal[i]
+        held = row_sum[i]
         inverse = scalar(0.0)
         if total > scalar(0.0):
             if contact_scalar:
                 total += contact_scalar[i]
+                held += contact_scalar[i]
             inverse = scalar(1.0) / total
             if contact_block:
                 block = contact_block[i]
@@ -206,6 +213,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         block[k, k] += total
                     inverse_block_out[i] = invert(block)
         total_out[i] = total
+        held_out[i] = held
         inverse_out[i] = inverse
 
     return SimpleNamespace(**locals())

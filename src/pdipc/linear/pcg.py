@@ -66,7 +66,7 @@ class Pcg(Solver):
         apply = contact.apply if contact is not None else None
         coupled = int(apply is not None)
         k, sums = self._kernels, self.sums
-        matrix = [*self.system.rows.arguments, self.total]
+        matrix = [*self.system.rows.arguments, self.held]
         status = [self.first, self.left, self.iterations, self.residual, self.condition]
         if not prepared:
             self.prepare(contact)
@@ -138,7 +138,7 @@ def kernels(real: Real) -> SimpleNamespace:
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
         inverse: wp.array(dtype=scalar),
         inverse_block: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
@@ -158,7 +158,7 @@ def kernels(real: Real) -> SimpleNamespace:
             r = zero
             u = zero
             if inverse[i] != scalar(0.0):
-                r = b[i] - diagonal[i] * x[i] - f.row_product(i, offsets, columns, values, x)
+                r = b[i] - held[i] * x[i] - f.row_difference(i, offsets, columns, values, x)
                 if coupled != 0:
                     r -= w[i]
                 u = f.precondition(i, inverse, inverse_block, r)
@@ -178,7 +178,7 @@ def kernels(real: Real) -> SimpleNamespace:
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
         u: wp.array(dtype=vec3),
         coupled: int,
         w: wp.array(dtype=vec3),
@@ -189,7 +189,7 @@ def kernels(real: Real) -> SimpleNamespace:
         delta = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             own = u[i]
-            product = diagonal[i] * own + f.row_product(i, offsets, columns, values, u)
+            product = held[i] * own + f.row_difference(i, offsets, columns, values, u)
             if coupled != 0:
                 product += w[i]
             w[i] = product

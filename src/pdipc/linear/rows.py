@@ -5,6 +5,7 @@ stored entry by entry, so that neighbouring threads read neighbouring memory.
 """
 
 import functools
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -68,7 +69,9 @@ def _sliced(matrix: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 # Two sums side by side, because an addition has to wait for the one before. On the CPU all three components are read and
 # multiplied as one register of four, whose last lane is the next vertex's and is dropped: vectors need one spare entry.
+# OWN(k) is what is taken off every vertex: zero, or the row's own vertex.
 _ROW_PRODUCT = """
+    const SCALAR own0 = OWN(0), own1 = OWN(1), own2 = OWN(2);
 #if defined(__CUDA_ARCH__)
     const int slice = i / SLICE;
     const int high = offsets.data[slice + 1];
@@ -76,7 +79,7 @@ _ROW_PRODUCT = """
     for (int e = offsets.data[slice] + i % SLICE; e < high; e += SLICE) {
         const SCALAR v = values.data[e];
         const auto& p = x.data[columns.data[e]];
-        a += v * p.c[0]; b += v * p.c[1]; c += v * p.c[2];
+        a += v * (p.c[0] - own0); b += v * (p.c[1] - own1); c += v * (p.c[2] - own2);
     }
     return {a, b, c};
 #else
@@ -85,13 +88,14 @@ _ROW_PRODUCT = """
     const SCALAR* value = values.data;
     const SCALAR* vertex = (const SCALAR*)x.data;
     const int high = offsets.data[i + 1];
+    const four own = {own0, own1, own2, 0};
     four a = {0, 0, 0, 0}, b = {0, 0, 0, 0};
     int e = offsets.data[i];
     for (; e + 1 < high; e += 2) {
-        a += value[e] * *(const four*)(vertex + 3 * (long long)column[e]);
-        b += value[e + 1] * *(const four*)(vertex + 3 * (long long)column[e + 1]);
+        a += value[e] * (*(const four*)(vertex + 3 * (long long)column[e]) - own);
+        b += value[e + 1] * (*(const four*)(vertex + 3 * (long long)column[e + 1]) - own);
     }
-    if (e < high) { a += value[e] * *(const four*)(vertex + 3 * (long long)column[e]); }
+    if (e < high) { a += value[e] * (*(const four*)(vertex + 3 * (long long)column[e]) - own); }
     a += b;
     return {a[0], a[1], a[2]};
 #endif
@@ -100,10 +104,14 @@ _ROW_PRODUCT = """
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    """The product of one row with a vector of 3-vectors."""
-    scalar, vec3 = real.scalar, real.vec3
+    """The product of one row with a vector of 3-vectors: sum_j a_ij x_j, and sum_j a_ij (x_j - x_i).
 
-    @wp.func_native(_ROW_PRODUCT.replace("SCALAR", f"wp::{real.name}").replace("SLICE", str(SLICE)))
+    The second, where it can be had, leaves nothing of a common motion of all vertices, whatever float32 made of a_ij.
+    """
+    scalar, vec3 = real.scalar, real.vec3
+    product = _ROW_PRODUCT.replace("SCALAR", f"wp::{real.name}").replace("SLICE", str(SLICE))
+
+    @wp.func_native(re.sub(r"OWN\(\d\)", "0", product))
     def row_product(
         i: int,
         offsets: wp.array(dtype=wp.int32),
@@ -112,4 +120,13 @@ def functions(real: Real) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
     ) -> vec3: ...
 
-    return SimpleNamespace(row_product=row_product)
+    @wp.func_native(re.sub(r"OWN\((\d)\)", r"x.data[i].c[\1]", product))
+    def row_difference(
+        i: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=scalar),
+        x: wp.array(dtype=vec3),
+    ) -> vec3: ...
+
+    return SimpleNamespace(row_product=row_product, row_difference=row_difference)

@@ -30,10 +30,12 @@ class Solver:
     iterations: (1,) int32 on the device, iterations done since the caller last set it to zero.
     residual: (1,) on the device, the last solve's residual norm relative to `first`.
     first: (1,) on the device, the residual norm that the tolerance of the last solve referred to, N/sqrt(kg/s^2).
+    moves_bodies: whether a few iterations find the common motion of a stiff body; else see translations.py.
     recordable: whether `solve` may be called inside `device.capture`.
     dropped: largest part of a row of the iteration matrix that was left out; 0 for all but A-Jacobi with `drop` or `split`.
     """
 
+    moves_bodies = False
     recordable = True
     dropped = 0.0
 
@@ -50,7 +52,8 @@ class Solver:
         self.iterations, self.residual, self.first = self.zeros(wp.int32, 1), self.zeros(scalar, 1), self.zeros(scalar, 1)
         self.left, self.condition = self.zeros(wp.int32, 1), self.zeros(wp.int32, 1)
         self.partial = self.zeros(scalar, self.sums.slots)
-        self.total, self.inverse, self.inverse_block = self.zeros(scalar), self.zeros(scalar), self.zeros(self.real.mat33)
+        self.total, self.held = self.zeros(scalar), self.zeros(scalar)
+        self.inverse, self.inverse_block = self.zeros(scalar), self.zeros(self.real.mat33)
         self.preconditioner = [self.inverse, self.inverse_block]
         self._shared = kernels.kernels(self.real)
 
@@ -58,7 +61,8 @@ class Solver:
         """Launches what depends on A and the contacts alone, not on x and b."""
         scalar = contact.scalar if contact is not None else None
         block = contact.diagonal if contact is not None else None
-        inputs = [self.system.diagonal, scalar, block, self.total, self.inverse, self.inverse_block]
+        system = self.system
+        inputs = [system.diagonal, system.row_sum, scalar, block, self.total, self.held, self.inverse, self.inverse_block]
         self.device.launch(self._shared.invert_diagonal, self.system.count, inputs, grain=8)
 
     def solve(

@@ -36,6 +36,8 @@ def interval(system: "System") -> tuple[float, float]:
     system.device.capture(lambda: solver.solve(x, b), solver).launch()
     count = int(solver.iterations.numpy()[0])
     alpha, beta = solver.steps.numpy()[:count].astype(np.float64).T
+    count = int(np.argmin(np.append(alpha > 0.0, False)))  # in float32 a stiff matrix may end with a step that is rounding
+    alpha, beta = alpha[:count], beta[:count]
     diagonal = 1.0 / alpha
     diagonal[1:] += beta[:-1] / alpha[:-1]
     beside = np.sqrt(beta[:-1]) / alpha[:-1]

@@ -19,7 +19,8 @@ class System:
     free: (n,) bool; False for vertices whose position is prescribed: solvers read it and leave it as it is.
 
     rows: the off-diagonal entries of the free rows on the device.
-    diagonal: (n,) A_ii where free, 0 elsewhere, on the device, kg/s^2.
+    diagonal: (n,) A_ii where free, 0 elsewhere, on the device, kg/s^2. row_sum: (n,) sum_j A_ij likewise: what moving everything
+        together costs, mass/h^2 and pins, added up in double precision.
     Raises ValueError where the matrix is not square, not symmetric, or a free vertex has a diagonal entry that is not positive.
     """
 
@@ -36,6 +37,8 @@ class System:
         rows.sort_indices()
         self.rows = Rows(device, real, rows)
         self.diagonal = wp.array(np.where(free, matrix.diagonal(), 0.0).astype(real.numpy), device=device.warp)
+        row_sum = np.where(free, np.asarray(matrix.sum(axis=1)).ravel(), 0.0)
+        self.row_sum = wp.array(row_sum.astype(real.numpy), device=device.warp)
 
     @functools.cached_property
     def interval(self) -> tuple[float, float]:
