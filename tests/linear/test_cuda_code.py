@@ -3,7 +3,7 @@
 import pytest
 import warp as wp
 
-from pdipc.linear import aggregated, coarse, gauss_seidel, jacobi, kernels, pcg, powers
+from pdipc.linear import aggregated, coarse, gauss_seidel, jacobi, kernels, pcg, powers, translations
 from pdipc.precision import real
 
 FACTORIES = {
@@ -15,6 +15,7 @@ FACTORIES = {
     "a-jacobi in groups": lambda precision: aggregated.group_kernels(precision, aggregated.capacity_on_cuda(precision)),
     "matrix powers": lambda precision: powers.group_kernels(precision, powers.capacity_on_cuda(precision)),
     "gauss-seidel": gauss_seidel.kernels,
+    "translations": translations.kernels,
 }
 
 
