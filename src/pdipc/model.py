@@ -27,7 +27,7 @@ from pdipc.forces import ExternalForces
 from pdipc.linear.solver import Solver
 from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
-from pdipc.parallel import Device
+from pdipc.parallel import Device, one_at_a_time
 from pdipc.precision import Real, real
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
@@ -132,6 +132,7 @@ class Model:
         """Simulated and kinematic vertices together."""
         return len(self.mass)
 
+    @one_at_a_time
     def initial_state(self) -> State:
         """The scene's start: time 0, with its initial velocities."""
         a = self.assembly
@@ -167,6 +168,7 @@ class Model:
         return targets
 
 
+@one_at_a_time
 def build(scene: Scene, device: str | None = None) -> Model:
     """Assembles a scene on a device: "cpu", "cuda:0", or None for the scene's choice, else CUDA where there is one.
 

@@ -17,6 +17,7 @@ Two kinds of kernels:
 import functools
 import itertools
 import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -24,6 +25,23 @@ from typing import Any
 import warp as wp
 
 from pdipc.precision import Real
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+def one_at_a_time(function: Callable) -> Callable:
+    """Decorator for what launches or records: callers in several threads take turns.
+
+    Warp has one recording at a time, and takes into it what any thread launches. A launch uses all cores anyway.
+    """
+
+    @functools.wraps(function)
+    def taking_turns(*args: Any, **kwargs: Any) -> Any:
+        with _ONE_AT_A_TIME:
+            return function(*args, **kwargs)
+
+    return taking_turns
+
 
 SCAN_BLOCK = 256  # numbers that a block of CUDA threads scans together
 REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads

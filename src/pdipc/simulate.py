@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pdipc.model import Model, State, build
+from pdipc.parallel import one_at_a_time
 from pdipc.scene.schema import Scene
 from pdipc.step import StepResult, Work, step
 
@@ -90,6 +91,7 @@ class Simulation:
             results.append(result)
         return _merge(results)
 
+    @one_at_a_time
     def reset(self) -> None:
         """Back to the start, with no vertex pulled."""
         self.set_vertex_force(np.zeros(0), np.zeros((0, 3)))

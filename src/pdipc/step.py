@@ -18,7 +18,7 @@ from pdipc.energy_rate import EnergyRate
 from pdipc.forces import Loads
 from pdipc.linear import Translations
 from pdipc.model import Model, State
-from pdipc.parallel import Graph, Reducer
+from pdipc.parallel import Graph, Reducer, one_at_a_time
 from pdipc.precision import Real
 from pdipc.witness import find_intersections
 
@@ -306,6 +306,7 @@ class Work:
     is for a solver that the host drives, and, with a warning, on a CUDA driver that has no loops in graphs.
     """
 
+    @one_at_a_time
     def __init__(self, model: Model, recorded: bool = True):
         device, real, n = model.device, model.real, model.vertex_count
         vec3, scalar = real.vec3, real.scalar
@@ -504,6 +505,7 @@ class Work:
         self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), self.clock])
 
 
+@one_at_a_time
 def step(
     model: Model, state: State, work: Work | None = None, observe: Callable | None = None, into: State | None = None
 ) -> StepResult:

@@ -1,6 +1,7 @@
 """A step as one recorded graph gives the bits of the same step launched kernel by kernel, however it is watched."""
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -106,3 +107,19 @@ def test_recording_allocates_nothing(monkeypatch):
     monkeypatch.setattr(pdipc.parallel.Device, "capture", counted)
     simulation.step()
     assert (allocated, recorded[0]) == ([], "whole_step")
+
+
+def test_simulations_in_several_threads_take_turns():
+    """Warp records whatever any thread launches: without turns, one simulation's step would become part of another's."""
+
+    def positions(_=None):
+        block = solid("block", (0.2, 0.2, 0.2), (2, 2, 2), at=(0, 0.103, 0), velocity=(0, -1, 0))
+        made = pdipc.Simulation(scene([block], [floor()]), "cpu")
+        for _ in range(5):
+            made.step()
+        return made.positions
+
+    expected = positions()
+    with ThreadPoolExecutor(3) as threads:
+        for found in threads.map(positions, range(3)):
+            np.testing.assert_array_equal(found, expected)
