@@ -105,7 +105,8 @@ class Contact(Table):
         "to reproduce the paper; as safe, but less accurate, and without friction.",
     )
     activation_distance: Positive | None = Field(
-        default=None, description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size."
+        default=None,
+        description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size; at least 1e-7 of it.",
     )
     minimum_separation: Positive | None = Field(
         default=None,
