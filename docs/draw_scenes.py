@@ -19,11 +19,11 @@ PICTURES = {
     "cloth_on_sphere": [],
     "box_stack": [],
     "squeeze": ["--frame", "110", "--color", "pressure"],
-    "thin_rod": ["--frame", "75"],
+    "thin_rod": ["--frame", "85"],
     "tori_in_bowl": ["--view", "0.5,1.1,0.8"],
-    "twisted_cloth": [],
-    "wind_flag": ["--frame", "150"],
-    "bear_on_stairs": [],
+    "twisted_cloth": ["--frame", "175"],
+    "wind_flag": ["--frame", "130", "--view", "0.2,0.2,1"],
+    "bear_on_stairs": ["--frame", "65"],
 }
 SIZE = "1200x800"
 
@@ -46,8 +46,8 @@ def main() -> None:
             command("check", run)
             command("render", run, "-o", picture, "--size", SIZE, *options)
             axis.imshow(plt.imread(picture))
-            axis.set_title(title(name), y=-0.11, fontsize=15)
-            axis.axis("off")
+            axis.set_xlabel(title(name), fontsize=15)
+            axis.set(xticks=[], yticks=[], frame_on=False)
     figure.savefig(out, dpi=100)
 
 

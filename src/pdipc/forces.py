@@ -1,4 +1,17 @@
-"""External forces f_ext of Eq. (1), as accelerations: gravity, wind on surfaces, forces on vertices."""
+"""External forces f_ext of Eq. (1), as accelerations: gravity, wind on surfaces, forces on vertices.
+
+Drag is taken at the start of a step, and would throw a light surface past the air where wind is strong or the step long. A
+triangle's drag is g (u.n) n with g = air_density / 2 drag |u.n| area, u the air's velocity past it. With F the sum of the thirds
+of it at a vertex, and G that of g, the vertex accelerates by
+
+    a = F / max(m, m / 2 + h G).
+
+Up to h G = m / 2 that is F / m. There the speed past a free plate that the wind meets head-on, |u| (1 - h G / m) after a step, would
+begin to fall with growing |u|; beyond, it tends to a limit, and never changes sign. No step takes the velocities of any surface
+further from that of the air, in the norm of max(m, m / 2 + h G): drag is linear in u with the matrix of g n n^T of the mean of
+three corners, summed over triangles, which as a diagonal matrix G bounds. F / (m + h G) would be exact for the free plate, but
+weaken the drag on a sail that is held in any wind.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -11,23 +24,24 @@ from pdipc.precision import Real
 from pdipc.scene.assembly import AssembledForce, AssembledWind, Assembly
 
 
-def wind_force(wind: AssembledWind, positions: np.ndarray, velocities: np.ndarray, time: float) -> np.ndarray:
-    """(n, 3) N: drag on each triangle, air_density / 2 drag |u.n| (u.n) area n with u the air's velocity past it, a third to
-    each of its vertices.
+def wind_drag(wind: AssembledWind, positions: np.ndarray, velocities: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Drag on each triangle, g (u.n) n with g = air_density / 2 drag |u.n| area and u the air's velocity past it, a third to
+    each of its vertices: F (n, 3) N and G (n,) kg/s.
     """
-    total = np.zeros_like(positions)
+    force, rate = np.zeros_like(positions), np.zeros(len(positions))
     if not wind.start <= time < wind.end:
-        return total
+        return force, rate
     corners = positions[wind.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double_area = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(double_area, 1e-300)[:, None]
     past = wind.velocity - velocities[wind.triangles].mean(axis=1)
     across = np.einsum("ij,ij->i", past, normal)
-    force = (0.25 * wind.air_density * wind.drag * np.abs(across) * across * double_area)[:, None] * normal
+    third = 0.25 * wind.air_density * wind.drag * np.abs(across) * double_area / 3.0
     for corner in range(3):
-        np.add.at(total, wind.triangles[:, corner], force / 3.0)
-    return total
+        np.add.at(force, wind.triangles[:, corner], (third * across)[:, None] * normal)
+        np.add.at(rate, wind.triangles[:, corner], third)
+    return force, rate
 
 
 def vertex_force(force: AssembledForce, count: int, time: float) -> np.ndarray:
@@ -39,13 +53,13 @@ def vertex_force(force: AssembledForce, count: int, time: float) -> np.ndarray:
 
 
 class ExternalForces:
-    """All external forces of an assembly. gravity: (3,) m/s^2; mass: (n,) kg, 0 for kinematic vertices.
+    """All external forces of an assembly. gravity: (3,) m/s^2; mass: (n,) kg, 0 for kinematic vertices; h: length of a step, s.
 
     pulled: vertices (k,) and forces (k, 3) N that a user applies by hand; replace it between steps.
     """
 
-    def __init__(self, assembly: Assembly, gravity: np.ndarray, mass: np.ndarray):
-        self.assembly, self.mass = assembly, mass
+    def __init__(self, assembly: Assembly, gravity: np.ndarray, mass: np.ndarray, h: float):
+        self.assembly, self.mass, self.h = assembly, mass, h
         self.gravity = np.tile(np.asarray(gravity, dtype=np.float64), (len(mass), 1))
         self.pulled: tuple[np.ndarray, np.ndarray] = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
@@ -60,22 +74,26 @@ class ExternalForces:
             force += vertex_force(each, len(force), time)
         vertices, pull = self.pulled
         np.add.at(force, vertices, pull)
-        return self.gravity + self._over_mass(force)
+        return self.gravity + force / self.inertia[:, None]
 
     def accelerations(self, time: float, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """(n, 3) m/s^2 at the given state, time in s."""
-        force = np.zeros_like(self.gravity)
+        """(n, 3) m/s^2 for a step from the given state, time in s."""
+        force, rate = np.zeros_like(self.gravity), np.zeros(len(self.mass))
         for wind in self.assembly.winds:
-            force += wind_force(wind, positions, velocities, time)
-        return self.steady(time) + self._over_mass(force)
+            each, its_rate = wind_drag(wind, positions, velocities, time)
+            force += each
+            rate += its_rate
+        return self.steady(time) + force / np.maximum(self.inertia, 0.5 * self.inertia + self.h * rate)[:, None]
 
-    def _over_mass(self, force: np.ndarray) -> np.ndarray:
-        return force / np.where(self.mass > 0.0, self.mass, np.inf)[:, None]
+    @property
+    def inertia(self) -> np.ndarray:
+        """(n,) kg: mass, and inf for kinematic vertices, which no force moves."""
+        return np.where(self.mass > 0.0, self.mass, np.inf)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    """`wind_force`, gathered by vertex so that sums keep their order."""
+    """`wind_drag`, gathered by vertex so that sums keep their order."""
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
@@ -89,11 +107,13 @@ def kernels(real: Real) -> SimpleNamespace:
         factor: wp.array(dtype=scalar),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        third_out: wp.array(dtype=vec3),
+        force_out: wp.array(dtype=vec3),
+        rate_out: wp.array(dtype=scalar),
     ):
-        """A third of the drag on each triangle: factor |u.n| (u.n) (double area) n."""
+        """A third of the drag on each triangle: its rate g = factor |u.n| (double area), and g (u.n) n."""
         t = first + wp.tid()
-        third = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        force = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        rate = scalar(0.0)
         if windows[t][0] <= time and time < windows[t][1]:
             q = triangles[t]
             normal = wp.cross(x[q[1]] - x[q[0]], x[q[2]] - x[q[0]])
@@ -102,8 +122,10 @@ def kernels(real: Real) -> SimpleNamespace:
                 normal = normal / double_area
                 past = air[t] - (v[q[0]] + v[q[1]] + v[q[2]]) / scalar(3.0)
                 across = wp.dot(past, normal)
-                third = factor[t] * wp.abs(across) * across * double_area * normal
-        third_out[t] = third
+                rate = factor[t] * wp.abs(across) * double_area
+                force = rate * across * normal
+        force_out[t] = force
+        rate_out[t] = rate
 
     @wp.kernel(module=module)
     def gather(
@@ -111,15 +133,19 @@ def kernels(real: Real) -> SimpleNamespace:
         starts: wp.array(dtype=wp.int32),
         members: wp.array(dtype=wp.int32),
         third: wp.array(dtype=vec3),
-        inverse_mass: wp.array(dtype=scalar),
+        rate: wp.array(dtype=scalar),
+        inertia: wp.array(dtype=scalar),
+        h: scalar,
         steady: wp.array(dtype=vec3),
         acceleration_out: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
         force = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        total_rate = scalar(0.0)
         for k in range(starts[i], starts[i + 1]):
             force += third[members[k]]
-        acceleration_out[i] = steady[i] + inverse_mass[i] * force
+            total_rate += rate[members[k]]
+        acceleration_out[i] = steady[i] + force / wp.max(inertia[i], scalar(0.5) * inertia[i] + h * total_rate)
 
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 
@@ -151,13 +177,12 @@ class Loads:
         corner = triangles.ravel()
         order = np.argsort(corner, kind="stable")
         starts = np.searchsorted(corner[order], np.arange(n + 1))
-        inverse_mass = np.where(external.mass > 0.0, 1.0 / np.where(external.mass > 0.0, external.mass, 1.0), 0.0)
         self._steady = wp.zeros_like(self.acceleration)
-        self._third = wp.zeros(self._count, dtype=real.vec3, device=device.warp)
+        self._drag = [wp.zeros(self._count, dtype=dtype, device=device.warp) for dtype in (real.vec3, real.scalar)]
         self._triangles = [upload(triangles, wp.vec3i), upload(windows, wp.vec2d), upload(air.astype(real.numpy), real.vec3)]
         self._triangles.append(upload(factor.astype(real.numpy), real.scalar))
         self._incident = [upload(starts.astype(np.int32), wp.int32), upload((order // 3).astype(np.int32), wp.int32)]
-        self._inverse_mass = upload(inverse_mass.astype(real.numpy), real.scalar)
+        self._inertia = upload(external.inertia.astype(real.numpy), real.scalar)
 
     def update(self, time: float, x: wp.array, v: wp.array) -> None:
         """Launches the accelerations at positions x and velocities v, (n,) vec3, at `time`, s."""
@@ -167,7 +192,8 @@ class Loads:
             self._steady.assign(external.steady(time).astype(self.real.numpy))
             self._uploaded = acting, external.pulled
         if self._count:
-            inputs = [wp.float64(time), *self._triangles, x, v, self._third]
+            inputs = [wp.float64(time), *self._triangles, x, v, *self._drag]
             self.device.launch(self._kernels.drag, self._count, inputs, grain=16)
-            inputs = [*self._incident, self._third, self._inverse_mass, self._steady, self.acceleration]
+            h = self.real.scalar(external.h)
+            inputs = [*self._incident, *self._drag, self._inertia, h, self._steady, self.acceleration]
             self.device.launch(self._kernels.gather, len(x), inputs, grain=8)

@@ -251,7 +251,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
         solver=solver,
         surface=skin,
         broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
-        external=ExternalForces(assembly, np.array(sim.gravity), mass),
+        external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
         rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
         triangles=assembly.triangles,
     )

@@ -12,6 +12,7 @@ from pdipc.scene.check import (
     edge_edge_distances,
     point_segment_distances,
     refuse,
+    smallest_activation,
     smallest_separation,
     vertex_triangle_distances,
     winding_number,
@@ -236,6 +237,31 @@ def test_separations_below_rounding():
     assert least == pytest.approx(100 * 2.0**-14)
     scene.contact.minimum_separation = least
     assert check(scene) == []
+
+
+def test_activation_distances_too_short_for_forces():
+    scene = load_scene("box_stack")
+    size = assemble(scene).scene_size
+    scene.contact.activation_distance = 2e-9 * size
+    (finding,) = check(scene)
+    told = str(finding)
+    assert told.startswith(f"contact.activation_distance: {2e-9 * size:.3g} m is so short a range that rounding decides")
+    assert f"it must be at least {1e-7 * size:.3g} m: 1e-07 of the scene size of {size:.4g} m" in told
+    scene.contact.activation_distance = smallest_activation(assemble(scene), "float64")
+    assert check(scene) == []
+
+
+def test_activation_distances_below_rounding():
+    """In float32 it is the coordinates that count."""
+    scene = Scene(bodies=[Solid(name="s", mesh=BOX, translation=(1000, 0, 0))], contact={"minimum_separation": 0.01})
+    scene.simulation.precision = "float32"
+    least = smallest_activation(assemble(scene), "float32")
+    assert least == pytest.approx(10 * 2.0**-14)
+    scene.contact.activation_distance = least
+    assert check(scene) == []
+    scene.contact.activation_distance = 0.99 * least
+    (finding,) = check(scene)
+    assert "10 roundings of float32 coordinates up to 1000 m" in str(finding)
 
 
 def test_unreadable_meshes_are_found_together():

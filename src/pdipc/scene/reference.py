@@ -1,5 +1,6 @@
 """The reference of the scene format, made from the models: `python -m pdipc.scene.reference > docs/scene_format.md`."""
 
+import inspect
 import types
 import typing
 from typing import Any, Literal
@@ -70,7 +71,7 @@ def markdown() -> str:
 
 
 def _table(model: type[BaseModel]) -> str:
-    lines = [f"### {model.__name__}", "", (model.__doc__ or "").strip(), ""]
+    lines = [f"### {model.__name__}", "", inspect.cleandoc(model.__doc__ or ""), ""]
     lines += ["| key | value | default | meaning |", "| --- | --- | --- | --- |"]
     for name, field in model.model_fields.items():
         value = _type(field.annotation) + _range(field.metadata)
