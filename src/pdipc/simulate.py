@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from pdipc.model import Model, State, build
 from pdipc.parallel import one_at_a_time
@@ -96,6 +97,7 @@ class Simulation:
         """Back to the start, with no vertex pulled."""
         self.set_vertex_force(np.zeros(0), np.zeros((0, 3)))
         self.state = self.model.initial_state()
+        wp.copy(self.work.x, self.state.positions)  # the start was judged when the model was built
         self.work.candidates.invalidate()
 
 
