@@ -8,6 +8,7 @@ import warp as wp
 
 from pdipc.model import Model, State, build
 from pdipc.output.results import Run
+from pdipc.parallel import one_at_a_time
 from pdipc.scene.schema import Scene
 from pdipc.step import Work
 
@@ -33,6 +34,7 @@ class Audit:
         return self.kinetic + self.elastic + self.barrier + self.gravity
 
 
+@one_at_a_time
 def audit(model: Model, state: State, work: Work) -> Audit:
     """The energies and momenta of `state`."""
     work.list_pairs(state.positions)
@@ -54,6 +56,7 @@ def audit(model: Model, state: State, work: Work) -> Audit:
     )
 
 
+@one_at_a_time
 def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
     """(n, 3) N: the barrier's force on every vertex, on obstacles too; the resultant on a body is the sum over its vertices.
 

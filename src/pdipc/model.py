@@ -92,7 +92,7 @@ class Settings:
     restitution: float | None
     damping: float  # 1/s
     budget_ms: float | None  # of one sub-step
-    margin: float  # m: how far a vertex may leave its swept box before candidates are listed again
+    margin: float  # m: how far a vertex may stray from the motion that candidates were listed for
 
 
 @dataclass

@@ -122,16 +122,12 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         x0: wp.array(dtype=vec3),
         x1: wp.array(dtype=vec3),
-        half_separation: wp.array(dtype=scalar),
-        half_reach: scalar,
         begin_out: wp.array(dtype=vec3),
         end_out: wp.array(dtype=vec3),
-        reach_out: wp.array(dtype=scalar),
     ):
         i = first + wp.tid()
         begin_out[i] = x0[i]
         end_out[i] = x1[i]
-        reach_out[i] = half_separation[i] + half_reach
 
     return SimpleNamespace(
         vertex_triangle_limits=vertex_triangle_limits,
@@ -195,7 +191,8 @@ class Candidates:
         self.rest = wp.array(rest_positions, dtype=real.vec3, device=device.warp)
         self.begin = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
-        self.reach = wp.zeros(n, dtype=real.scalar, device=device.warp)
+        reach = half_separation.numpy() + (0.5 * activation_distance + margin)
+        self.reach = wp.array(reach, dtype=real.scalar, device=device.warp)
         self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
         self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.sieve = sieve.functions(real).Sieve()
@@ -234,9 +231,7 @@ class Candidates:
     def cover(self, x0: wp.array, x1: wp.array) -> None:
         """Lists every pair that can meet, or act, while each vertex stays within the margin of its way from x0 to x1, all of
         them at the same fraction of it."""
-        half_reach = 0.5 * self.activation_distance + self.margin
-        inputs = [x0, x1, self.half_separation, half_reach, self.begin, self.end, self.reach]
-        self.device.launch(self.kernels.keep, len(x0), inputs)
+        self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
         self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
         common = [self.surface.body_of_vertex, self.rest, self.half_separation, self.activation_distance]
         primitives = (self.surface.triangles, self.surface.edges)
