@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import pdipc
-from pdipc.step import Work, step
+from pdipc.drive import Work, step
 
 sys.path.append(str(Path(__file__).parent))
 from baselines.common import Cholesky

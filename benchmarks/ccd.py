@@ -31,9 +31,9 @@ sys.path.insert(0, str(REPOSITORY / "tests"))
 
 from contact import exact, hard_queries  # noqa: E402
 
-from pdipc import precision  # noqa: E402
-from pdipc.contact import ccd, queries  # noqa: E402
-from pdipc.parallel import Device  # noqa: E402
+from pdipc.collision import ccd, queries  # noqa: E402
+from pdipc.device import precision  # noqa: E402
+from pdipc.device.launch import Device  # noqa: E402
 
 DATA = Path(os.environ.get("PDIPC_DATA", REPOSITORY.parent / "shared" / "data")) / "ccd"
 BACKOFF = 0.1  # as ipctk's AdditiveCCD: 0.9 of the gap is used up
@@ -101,10 +101,10 @@ def step_mix(size: int = 48, seed: int = 0) -> dict[str, np.ndarray]:
 
 def record(scene_name: str, steps: int, output: Path) -> None:
     """Writes the queries of a scene's step number `steps`: of every outer iteration, a pair at most once an iteration."""
-    from pdipc.contact.truncation import Truncation
+    from pdipc.collision.truncation import Truncation
+    from pdipc.drive import Work
     from pdipc.scene.load import load_scene
-    from pdipc.simulate import Simulation
-    from pdipc.step import Work
+    from pdipc.simulation import Simulation
 
     simulation = Simulation(load_scene(scene_name), device="cpu")
     simulation.work = Work(simulation.model, recorded=False)  # so that Python sees every outer iteration

@@ -2,7 +2,7 @@
 
 A cloth above a ball (sparse) and a pile of wavy sheets (rich), both trembling, and the pile turning about the vertical by up to
 five edges (fast); 10K to 200K triangles. Vertex-triangle and edge-edge pairs that boxes leave, ours as they move along, IPC Toolkit's swept;
-and, of ours, what the sieve leaves of them (contact/sieve.py), which is what a step uses. Median of several runs, after a first
+and, of ours, what the sieve leaves of them (collision/sieve.py), which is what a step uses. Median of several runs, after a first
 one that builds what is kept between steps. Writes benchmarks/results/culling.json.
 """
 
@@ -17,9 +17,9 @@ import ipctk
 import numpy as np
 import warp as wp
 
-from pdipc.contact import broad_phase, sieve, surface
-from pdipc.parallel import Device
-from pdipc.precision import real
+from pdipc.collision import broad_phase, sieve, surface
+from pdipc.device.launch import Device
+from pdipc.device.precision import real
 from pdipc.scene.generators import Grid, Sphere
 
 REPEATS = 7

@@ -32,14 +32,14 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(REPOSITORY / folder) for folder in ("src", ".", "benchmarks")]
 
 import pdipc  # noqa: E402
+from pdipc.device.launch import Device  # noqa: E402
+from pdipc.device.precision import Real, real  # noqa: E402
+from pdipc.drive import Work, step  # noqa: E402
 from pdipc.linear import make_solver  # noqa: E402
 from pdipc.linear.solvers import SOLVERS  # noqa: E402
-from pdipc.parallel import Device  # noqa: E402
-from pdipc.precision import Real, real  # noqa: E402
 from pdipc.reproduce import _common, fig8  # noqa: E402
 from pdipc.reproduce.armadillo import authors_scene  # noqa: E402
 from pdipc.reproduce.fig7 import Run, loads, table_cloth  # noqa: E402
-from pdipc.step import Work, step  # noqa: E402
 from tests.contact import hard_queries  # noqa: E402
 
 BUDGET = 9 * 60 - 20  # s, with some left for the end

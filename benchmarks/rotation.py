@@ -21,7 +21,7 @@ import warp as wp
 from simulation import machine
 
 from pdipc.constraints import rotation
-from pdipc.precision import kernel, real
+from pdipc.device.precision import kernel, real
 
 
 def rotations(random: np.random.Generator, count: int) -> np.ndarray:

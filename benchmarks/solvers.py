@@ -32,11 +32,11 @@ sys.path.insert(0, str(REPOSITORY / "tests"))
 
 from linear import systems  # noqa: E402
 
+from pdipc.device.launch import Device  # noqa: E402
+from pdipc.device.precision import real  # noqa: E402
 from pdipc.linear import System, make_solver  # noqa: E402
-from pdipc.linear.powers import MatrixPowers  # noqa: E402
+from pdipc.linear.paper.powers import MatrixPowers  # noqa: E402
 from pdipc.model import DEFAULT_SOLVER  # noqa: E402
-from pdipc.parallel import Device  # noqa: E402
-from pdipc.precision import real  # noqa: E402
 
 GOAL = 1e-3
 LIMIT = 2.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pdipc.cli import app, metres
+from pdipc.cli.commands import app, metres
 from pdipc.output.results import RunWriter, open_run
 from tests.output import runs
 
@@ -54,7 +54,7 @@ def fake(monkeypatch):
             result = types.SimpleNamespace(outer=3, barriers=7, smallest_gap=float("inf"))
             progress(types.SimpleNamespace(step=step, steps=total, result=result))
 
-    monkeypatch.setitem(sys.modules, "pdipc.simulate", types.SimpleNamespace(run_scene=run_scene))
+    monkeypatch.setitem(sys.modules, "pdipc.simulation", types.SimpleNamespace(run_scene=run_scene))
     return calls
 
 
@@ -148,21 +148,21 @@ def test_an_interrupt_before_the_first_step_says_so(scene, tmp_path, monkeypatch
         except KeyboardInterrupt:
             raise turned_into("in the middle of an import") from None
 
-    monkeypatch.setitem(sys.modules, "pdipc.simulate", types.SimpleNamespace(run_scene=run_scene))
+    monkeypatch.setitem(sys.modules, "pdipc.simulation", types.SimpleNamespace(run_scene=run_scene))
     result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
     assert result.exit_code == 130
     assert "interrupted before a step was taken" in result.stderr
 
 
 def test_an_interrupt_that_a_library_loses_ends_the_run_after_a_step(fake, scene, tmp_path, monkeypatch):
-    steps = sys.modules["pdipc.simulate"].run_scene
+    steps = sys.modules["pdipc.simulation"].run_scene
 
     def run_scene(*args, **options):
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
         steps(*args, **options)
 
-    monkeypatch.setattr(sys.modules["pdipc.simulate"], "run_scene", run_scene)
+    monkeypatch.setattr(sys.modules["pdipc.simulation"], "run_scene", run_scene)
     result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
     assert (result.exit_code, "stopped after step 1 of 8" in result.stderr) == (130, True)
 

@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from pdipc import anderson, energy_rate, forces, parallel
+from pdipc.barrier import pairs, restitution
+from pdipc.collision import bvh, candidates, patches, queries, truncation
+from pdipc.collision import moving_boxes as sweep
 from pdipc.constraints import projector
-from pdipc.contact import bvh, candidates, pairs, paper, patches, queries, restitution, sweep, truncation
-from pdipc.precision import real
-from pdipc.step import kernels as step_kernels
+from pdipc.device import launch as parallel
+from pdipc.device.precision import real
+from pdipc.drive import kernels as step_kernels
+from pdipc.integration import loads as forces
+from pdipc.nonlinear import anderson
+from pdipc.paper_mode import energy_rate
+from pdipc.paper_mode import targets as paper
 
 FACTORIES = {
     "step": step_kernels,

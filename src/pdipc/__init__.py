@@ -4,12 +4,12 @@ Names are imported when they are first used, so that reading a result or printin
 """
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pdipc.contact.queries import time_of_impact as time_of_impact
+    from pdipc.collision.queries import time_of_impact as time_of_impact
+    from pdipc.drive import step as step
+    from pdipc.judge.witness import find_intersections as find_intersections
     from pdipc.model import build as build
     from pdipc.output.results import RunError as RunError
     from pdipc.output.results import open_run as open_run
@@ -17,11 +17,9 @@ if TYPE_CHECKING:
     from pdipc.scene.errors import SceneError as SceneError
     from pdipc.scene.load import load_scene as load_scene
     from pdipc.scene.schema import Scene as Scene
-    from pdipc.simulate import Simulation as Simulation
-    from pdipc.simulate import run_scene as run_scene
-    from pdipc.simulate import simulate as simulate
-    from pdipc.step import step as step
-    from pdipc.witness import find_intersections as find_intersections
+    from pdipc.simulation import Simulation as Simulation
+    from pdipc.simulation import run_scene as run_scene
+    from pdipc.simulation import simulate as simulate
 
 __version__ = "0.1.0"
 
@@ -29,28 +27,17 @@ _PUBLIC = {
     "RunError": "pdipc.output.results",
     "Scene": "pdipc.scene.schema",
     "SceneError": "pdipc.scene.errors",
-    "Simulation": "pdipc.simulate",
+    "Simulation": "pdipc.simulation",
     "build": "pdipc.model",
     "check_scene": "pdipc.scene.check:check",
-    "find_intersections": "pdipc.witness",
+    "find_intersections": "pdipc.judge.witness",
     "load_scene": "pdipc.scene.load",
     "open_run": "pdipc.output.results",
-    "run_scene": "pdipc.simulate",
-    "simulate": "pdipc.simulate",
-    "step": "pdipc.step",
-    "time_of_impact": "pdipc.contact.queries",
+    "run_scene": "pdipc.simulation",
+    "simulate": "pdipc.simulation",
+    "step": "pdipc.drive",
+    "time_of_impact": "pdipc.collision.queries",
 }
-
-
-class _Package(ModuleType):
-    """`pdipc.step` and `pdipc.simulate` are the functions, also once the modules of these names have been imported."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if not (name in _PUBLIC and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from pdipc.device.launch import one_at_a_time
+from pdipc.drive import Work
 from pdipc.model import Model, State, build
 from pdipc.output.results import Run
-from pdipc.parallel import one_at_a_time
 from pdipc.scene.schema import Scene
-from pdipc.step import Work
 
 
 @dataclass

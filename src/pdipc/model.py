@@ -9,6 +9,7 @@ import scipy.sparse
 import warp as wp
 
 from pdipc import constraints
+from pdipc.collision import broad_phase, surface
 from pdipc.constraints import (
     curved_bending,
     edge_length,
@@ -22,13 +23,12 @@ from pdipc.constraints import (
     triangle_strain,
     triangles,
 )
-from pdipc.contact import broad_phase, surface
-from pdipc.forces import ExternalForces
+from pdipc.device.launch import Device, one_at_a_time
+from pdipc.device.precision import Real, real
+from pdipc.integration.loads import ExternalForces
 from pdipc.linear.solver import Solver
 from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
-from pdipc.parallel import Device, one_at_a_time
-from pdipc.precision import Real, real
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial
@@ -102,7 +102,7 @@ class Model:
     Arrays over all n vertices, simulated and kinematic: mass (n,) kg, 0 where kinematic; free (n,) 1 or 0;
     half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness;
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
-    its body is stopped as a whole within a step (contact/restitution.py), 1 where kinematic.
+    its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
     rigid: vertex ranges of the moving obstacles. triangles: (m, 3) int32, all surfaces.
     """
 

@@ -16,8 +16,8 @@ from pdipc.constraints import (
     triangle_area,
     triangle_strain,
 )
-from pdipc.parallel import Device
-from pdipc.precision import real
+from pdipc.device.launch import Device
+from pdipc.device.precision import real
 
 DEVICE = Device("cpu", threads=1)
 REST_ENERGY = 1e-18  # J, of elements with weights of about one

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from physics.scenes import cloth, floor, scene, solid, watched
 
 import pdipc
-from pdipc.output.certify import certify
+from pdipc.judge.certify import certify
 from pdipc.output.results import open_run
-from pdipc.simulate import run_scene
+from pdipc.simulation import run_scene
 
 STEPS, OUTER = 3, 6
 

@@ -4,8 +4,8 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from pdipc.parallel import Device
-from pdipc.precision import Real
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
 
 
 class CoupledContact:

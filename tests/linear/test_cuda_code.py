@@ -3,8 +3,10 @@
 import pytest
 import warp as wp
 
-from pdipc.linear import aggregated, coarse, gauss_seidel, jacobi, kernels, pcg, powers, translations
-from pdipc.precision import real
+from pdipc.device.precision import real
+from pdipc.linear import coarse, kernels, pcg, translations
+from pdipc.linear.paper import a_jacobi as aggregated
+from pdipc.linear.paper import gauss_seidel, jacobi, powers
 
 FACTORIES = {
     "shared": kernels.kernels,

@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from pdipc.parallel import Device
-from pdipc.precision import real
+from pdipc.device.launch import Device
+from pdipc.device.precision import real
 from pdipc.reproduce import fig7, fig8
 
 pytest.importorskip("matplotlib")

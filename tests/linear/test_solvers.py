@@ -10,9 +10,9 @@ import warp as wp
 
 from linear import systems
 from linear.contacts import CoupledContact, ScalarContact
+from pdipc.device.launch import Device
+from pdipc.device.precision import real
 from pdipc.linear import SOLVERS, System, kernels, make_solver
-from pdipc.parallel import Device
-from pdipc.precision import real
 
 MESHES = ("regular tets", "jittered Delaunay", "slivers", "soft cloth", "stiff cloth")
 meshes = functools.cache(systems.meshes)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import pdipc
-from pdipc.forces import Loads
+from pdipc.integration.loads import Loads
 from pdipc.model import build
 
 from .scenes import cloth, floor, scene, solid

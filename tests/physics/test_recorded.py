@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 
 import pdipc
-import pdipc.parallel
-from pdipc.step import Work, step
+import pdipc.device.launch
+from pdipc.drive import Work, step
 from physics.scenes import cloth, floor, scene, solid
 
 
@@ -85,7 +85,7 @@ def test_a_step_leaves_the_state_that_it_starts_from():
 def test_a_driver_without_loops_in_graphs(monkeypatch):
     """Each kernel is launched alone, with the same bits, and the user is told."""
     expected, counts = run("float64")
-    monkeypatch.setattr(pdipc.parallel.Device, "records_loops", False)
+    monkeypatch.setattr(pdipc.device.launch.Device, "records_loops", False)
     with pytest.warns(UserWarning, match="cpu has no loops in graphs"):
         positions, found = run("float64")
     assert np.array_equal(positions, expected)
@@ -96,7 +96,7 @@ def test_recording_allocates_nothing(monkeypatch):
     """CUDA refuses memory inside the loops of a graph."""
     simulation = pdipc.Simulation(falling_cloth("float64"), "cpu")
     device, allocated, recorded = wp.get_device("cpu"), [], []
-    allocate, capture = device.default_allocator.allocate, pdipc.parallel.Device.capture
+    allocate, capture = device.default_allocator.allocate, pdipc.device.launch.Device.capture
 
     def counted(self, launches, keep_alive=None):
         with monkeypatch.context() as patch:
@@ -104,7 +104,7 @@ def test_recording_allocates_nothing(monkeypatch):
             recorded.append(launches.__name__)
             return capture(self, launches, keep_alive)
 
-    monkeypatch.setattr(pdipc.parallel.Device, "capture", counted)
+    monkeypatch.setattr(pdipc.device.launch.Device, "capture", counted)
     simulation.step()
     assert (allocated, recorded[0]) == ([], "whole_step")
 

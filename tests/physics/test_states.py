@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pdipc
-from pdipc.step import Work, step
+from pdipc.drive import Work, step
 from physics.scenes import cloth, floor, scene, solid
 
 

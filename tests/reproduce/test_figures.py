@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip("matplotlib", reason="needs matplotlib (extra: pictures)")
 pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
 
+from pdipc.device.launch import Device
 from pdipc.output.results import open_run
-from pdipc.parallel import Device
 from pdipc.reproduce import _common, armadillo, fig9, fig10, fig12
 from pdipc.scene import meshes
 

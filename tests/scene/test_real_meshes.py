@@ -4,9 +4,9 @@ import data
 import numpy as np
 import pytest
 
+from pdipc.judge.witness import find_intersections
 from pdipc.scene.check import check
 from pdipc.scene.schema import Cloth, Scene, Solid
-from pdipc.witness import find_intersections
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 from pdipc.constraints import rows
 from pdipc.constraints.base import ConstraintSet, make_set
 from pdipc.constraints.quadratic_bending import curvature_rows, hinges
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "curved_bending"
 CORNERS = 4

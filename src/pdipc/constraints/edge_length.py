@@ -10,7 +10,7 @@ import numpy as np
 
 from pdipc.constraints import rows
 from pdipc.constraints.base import ConstraintSet, make_set
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "edge_length"
 CORNERS = 2

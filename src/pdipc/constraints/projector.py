@@ -17,8 +17,8 @@ from pdipc.constraints import (
     triangle_strain,
 )
 from pdipc.constraints.base import ConstraintSet
-from pdipc.parallel import Device, Reducer
-from pdipc.precision import Real
+from pdipc.device.launch import Device, Reducer
+from pdipc.device.precision import Real
 
 KINDS = (
     tet_strain,

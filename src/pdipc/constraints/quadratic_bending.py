@@ -14,7 +14,7 @@ import warp as wp
 
 from pdipc.constraints import rows
 from pdipc.constraints.base import ConstraintSet, make_set
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "quadratic_bending"
 CORNERS = 4

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 REFINEMENTS = 2  # of the SVD's rotation
 NEWTON_STEPS = 16  # at most; three or four are usual

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.constraints.base import ConstraintSet
-from pdipc.parallel import Device
-from pdipc.precision import Real
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
 
 
 def arguments(device: Device, real: Real, s: ConstraintSet) -> list:

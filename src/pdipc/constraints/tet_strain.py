@@ -7,7 +7,7 @@ import numpy as np
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "tet_strain"
 CORNERS = tets.CORNERS

@@ -12,7 +12,7 @@ import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "tet_volume"
 CORNERS = tets.CORNERS

@@ -12,7 +12,7 @@ import warp as wp
 from pdipc.constraints import triangle_strain, triangles
 from pdipc.constraints.base import ConstraintSet
 from pdipc.constraints.tet_volume import ITERATIONS, SETTLED
-from pdipc.precision import Real
+from pdipc.device.precision import Real
 
 NAME = "triangle_area"
 CORNERS = triangles.CORNERS

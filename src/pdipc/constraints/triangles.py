@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from pdipc.constraints.base import ConstraintSet, make_set
-from pdipc.parallel import Device
-from pdipc.precision import Real
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
 
 CORNERS = 3
 

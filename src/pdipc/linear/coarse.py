@@ -17,11 +17,11 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse import csgraph
 
+from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition, pcg
 from pdipc.linear.solver import Contact
 from pdipc.linear.system import System
-from pdipc.precision import Real
 
 GROUP = 64  # vertices of a group
 MAX_GROUPS = 2048  # larger meshes get larger groups

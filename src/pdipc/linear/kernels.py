@@ -15,9 +15,9 @@ from typing import Any
 
 import warp as wp
 
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
 from pdipc.linear import rows
-from pdipc.parallel import Device
-from pdipc.precision import Real
 
 BLOCK = 256  # vertices whose numbers are added up together
 HIDDEN = 16.0  # unit roundoffs of the trace of a 3x3 block: what its rounding errors may hide, and more

@@ -14,10 +14,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
 from pdipc.linear.system import System
-from pdipc.precision import Real
 
 # Slots of the array of numbers that a solve carries along.
 ALPHA, BETA, GAMMA = (wp.constant(k) for k in range(3))

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from pdipc.linear.aggregated import AJacobi
 from pdipc.linear.coarse import TwoLevel
 from pdipc.linear.direct import Direct
-from pdipc.linear.gauss_seidel import GaussSeidel, Sor
-from pdipc.linear.jacobi import Chebyshev, Jacobi
+from pdipc.linear.paper.a_jacobi import AJacobi
+from pdipc.linear.paper.gauss_seidel import GaussSeidel, Sor
+from pdipc.linear.paper.jacobi import Chebyshev, Jacobi
+from pdipc.linear.paper.powers import MatrixPowers
 from pdipc.linear.pcg import Pcg
-from pdipc.linear.powers import MatrixPowers
 from pdipc.linear.solver import Solver
 from pdipc.linear.system import System
 

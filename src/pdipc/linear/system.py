@@ -6,9 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
 from pdipc.linear.rows import Rows
-from pdipc.parallel import Device
-from pdipc.precision import Real
 
 
 class System:
@@ -43,7 +43,7 @@ class System:
     @functools.cached_property
     def interval(self) -> tuple[float, float]:
         """[lo, hi], which holds all eigenvalues of D^-1 A on the free vertices (see spectrum.py)."""
-        from pdipc.linear import spectrum
+        from pdipc.linear.paper import spectrum
 
         return spectrum.interval(self)
 

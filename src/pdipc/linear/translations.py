@@ -16,10 +16,10 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse import csgraph
 
+from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact
 from pdipc.linear.system import System
-from pdipc.precision import Real
 
 
 class Translations:

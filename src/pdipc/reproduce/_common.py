@@ -12,12 +12,12 @@ from types import ModuleType
 
 import numpy as np
 
+from pdipc.judge.witness import find_intersections
 from pdipc.output.render import Picture
 from pdipc.output.results import Run, RunWriter, open_run
 from pdipc.scene.assembly import assemble
 from pdipc.scene.schema import Scene
-from pdipc.simulate import run_scene
-from pdipc.witness import find_intersections
+from pdipc.simulation import run_scene
 
 CHECKOUT = Path(__file__).parents[3]
 Arrays = dict[str, np.ndarray]

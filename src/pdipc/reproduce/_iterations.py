@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from pdipc import energy_rate
-from pdipc.contact.barrier import EXTENSION
+from pdipc.barrier.potential import EXTENSION
+from pdipc.drive import Work, step
 from pdipc.model import Model, State, build
+from pdipc.paper_mode import energy_rate
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
-from pdipc.step import Work, step
 
 WAYS = {
     "truncated after each L-G iteration": {"method": "paper", "inner_iterations": 1},

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdipc.contact.surface import unique_edges
+from pdipc.collision.surface import unique_edges
 from pdipc.output.results import Run
 from pdipc.reproduce import _common
 from pdipc.scene.assembly import Assembly, assemble

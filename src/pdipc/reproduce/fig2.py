@@ -6,7 +6,7 @@ import numpy as np
 
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
-from pdipc.simulate import simulate
+from pdipc.simulation import simulate
 
 HEIGHT, SPEED, TIME_STEP, RESTITUTION, ACTIVATION = 0.05, 2.0, 0.01, 0.5, 5e-3
 LABELS = {

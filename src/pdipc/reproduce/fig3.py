@@ -6,7 +6,7 @@ import numpy as np
 
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
-from pdipc.simulate import simulate
+from pdipc.simulation import simulate
 
 SPEED, TIME_STEP, SIDE = 2.0, 0.01, 0.1
 METHODS = {"paper": "paper mode", "barrier": "default mode"}

@@ -12,9 +12,9 @@ import warp as wp
 
 from pdipc.constraints import material, quadratic_bending, stiffness_matrix, triangle_strain
 from pdipc.constraints.triangles import rest_shape
+from pdipc.device.launch import Device, Graph
+from pdipc.device.precision import Real, real
 from pdipc.linear import System, make_solver
-from pdipc.parallel import Device, Graph
-from pdipc.precision import Real, real
 from pdipc.reproduce import _common
 from pdipc.scene.generators import Grid
 

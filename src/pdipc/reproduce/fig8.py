@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pdipc.parallel import Device
-from pdipc.precision import Real, real
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real, real
 from pdipc.reproduce import _common
 from pdipc.reproduce.fig7 import Run, describe, loads, table_cloth
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from pdipc.contact import surface
-from pdipc.contact.patches import PatchCulling
-from pdipc.contact.sieve import everything
-from pdipc.parallel import Device
-from pdipc.precision import real
+from pdipc.collision import surface
+from pdipc.collision.patches import PatchCulling
+from pdipc.collision.sieve import everything
+from pdipc.device.launch import Device
+from pdipc.device.precision import real
 from pdipc.reproduce import _common
 from pdipc.scene import meshes
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from pdipc.drive import Work, step
 from pdipc.model import Model, State, build
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
-from pdipc.step import Work, step
 
 COLUMNS = (
     "outer",

@@ -7,12 +7,12 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from pdipc import boxes
+from pdipc.judge import boxes
+from pdipc.judge.witness import find_intersections
 from pdipc.scene import meshes
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.errors import SceneError
 from pdipc.scene.schema import Scene
-from pdipc.witness import find_intersections
 
 LISTED = 5  # vertices that a finding names
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of

@@ -1,0 +1,1 @@
+"""The barrier of Section 4 and its friction and restitution."""

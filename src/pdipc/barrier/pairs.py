@@ -1,0 +1,486 @@
+"""Active pairs: the barriers of one outer iteration, and what the inner loop needs of them (Algorithm 1, line 5).
+
+At the feasible x of an outer iteration the pairs nearer than d_hat are listed and their witness weights a, normal n, gap d0 and
+stiffness are frozen. In the inner loop a pair's gap is linear in the iterate x~:
+
+    delta = d0 + n . sum_i a_i (x~_i - x_i),    force on vertex i: -f a_i n,    f = kappa m b'(delta)
+
+with b' extended linearly below gamma d0, since the iterate may pass through before it is truncated. This departs from Eq. (6):
+a position target cannot carry a force that grows without bound (docs/paper_map.md).
+
+Friction is Coulomb's, smoothed as in IPC: mu lambda f1(|u|) / |u| times the slip u since the start of the step, with the normal
+force lambda = -f and u of the iterate, as a spring that is renewed with every local-global iteration. Lagging it over an outer
+iteration does not work here: after a truncation the frozen gap, and so lambda, is far from equilibrium, and states limit-cycle.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.barrier import potential as barrier
+from pdipc.collision import distance
+from pdipc.collision.candidates import Candidates
+from pdipc.device.launch import Device, Reducer, Span
+from pdipc.device.precision import Real, kernel
+
+FIRST_PAIRS = 1024  # room at first
+LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
+    module = real.module(__name__)
+    dist, bar = distance.functions(real), barrier.functions(real)
+    far = wp.constant(real.scalar(1.0e30))
+    least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
+
+    @wp.func
+    def vertex_triangle_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
+        p = x[q[0]]
+        a = x[q[1]]
+        b = x[q[2]]
+        c = x[q[3]]
+        apart = wp.max(wp.max(wp.min(wp.min(a, b), c) - p, p - wp.max(wp.max(a, b), c)))
+        if apart >= limits[0] + limits[1]:
+            return far
+        w = dist.vertex_triangle_weights(p, a, b, c)
+        return wp.length(w[0] * (p - a) + w[2] * (b - a) + w[3] * (c - a)) - limits[0]
+
+    @wp.func
+    def edge_edge_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
+        a0 = x[q[0]]
+        a1 = x[q[1]]
+        b0 = x[q[2]]
+        b1 = x[q[3]]
+        apart = wp.max(wp.max(wp.min(b0, b1) - wp.max(a0, a1), wp.min(a0, a1) - wp.max(b0, b1)))
+        if apart >= limits[0] + limits[1]:
+            return far
+        w = dist.edge_edge_weights(a0, a1, b0, b1)
+        return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
+
+    def measure(kind: str, gap_of):
+        @kernel(module, f"measure_{kind}")
+        def measure_gaps(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
+            x: wp.array(dtype=vec3),
+            quads: wp.array(dtype=wp.vec4i),
+            limits: wp.array(dtype=vec2),
+            gaps_out: wp.array(dtype=scalar),
+            active_out: wp.array(dtype=wp.int32),
+            closest_out: wp.array(dtype=scalar),
+        ):
+            """Gaps of the candidates; for each block how many are active, and the negative of the smallest gap of those."""
+            worker = span.first + wp.tid()
+            for begin in range(worker * span.block, quads.shape[0], span.step * span.block):
+                active = int(0)
+                smallest = far
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    # CCD has proven it positive; measured in this precision it may round to less, of which there is no logarithm
+                    gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
+                    gaps_out[k] = gap
+                    if gap < limits[k][1]:
+                        active += 1
+                        smallest = wp.min(smallest, gap)
+                active_out[begin // span.block] = active
+                closest_out[begin // span.block] = -smallest
+
+        return measure_gaps
+
+    @wp.kernel(module=module)
+    def total(
+        first: int,
+        ends_a: wp.array(dtype=wp.int32),
+        ends_b: wp.array(dtype=wp.int32),
+        capacity: int,
+        count_out: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        """count: pairs that fit, all pairs, those of the first kind."""
+        first_kind = ends_a[ends_a.shape[0] - 1]
+        found = first_kind + ends_b[ends_b.shape[0] - 1]
+        count_out[0] = wp.min(found, capacity)
+        count_out[1] = found
+        count_out[2] = first_kind
+        if found > capacity:
+            overflow[0] = 1
+
+    def freeze(kind: str):
+        edge_edge = kind == "edge_edge"
+
+        @kernel(module, f"freeze_{kind}")
+        def freeze_pairs(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
+            x: wp.array(dtype=vec3),
+            quads: wp.array(dtype=wp.vec4i),
+            limits: wp.array(dtype=vec2),
+            gaps: wp.array(dtype=scalar),
+            ends: wp.array(dtype=wp.int32),
+            totals: wp.array(dtype=wp.int32),
+            kappa: wp.array(dtype=scalar),
+            friction: wp.array(dtype=scalar),
+            free: wp.array(dtype=scalar),
+            quads_out: wp.array(dtype=wp.vec4i),
+            weights_out: wp.array(dtype=vec4),
+            normals_out: wp.array(dtype=vec3),
+            gaps_out: wp.array(dtype=scalar),
+            activation_out: wp.array(dtype=scalar),
+            stiffness_out: wp.array(dtype=scalar),
+            coefficient_out: wp.array(dtype=scalar),
+            share_out: wp.array(dtype=scalar),
+        ):
+            worker = span.first + wp.tid()
+            for begin in range(worker * span.block, count[0], span.step * span.block):
+                slot = int(0)
+                if begin > 0:
+                    slot = ends[begin // span.block - 1]
+                if wp.static(edge_edge):
+                    slot += totals[2]
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    d_hat = limits[k][1]
+                    if gaps[k] < d_hat and slot < quads_out.shape[0]:
+                        q = quads[k]
+                        p0 = x[q[0]]
+                        p1 = x[q[1]] - p0
+                        p2 = x[q[2]] - p0
+                        p3 = x[q[3]] - p0
+                        zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+                        m = scalar(1.0)
+                        a = vec4()
+                        if wp.static(edge_edge):
+                            a = dist.edge_edge_weights(zero, p1, p2, p3)
+                            m = bar.mollifier(zero, p1, p2, p3)
+                        else:
+                            a = dist.vertex_triangle_weights(zero, p1, p2, p3)
+                        r = a[1] * p1 + a[2] * p2 + a[3] * p3
+                        n = wp.normalize(r)
+                        d0 = gaps[k]
+                        # a pair is as stiff as its bodies are heavy; kinematic vertices have no say
+                        ka = kappa[q[0]]
+                        kb = kappa[q[3]]
+                        stiffness = m * scalar(0.5) * (ka + kb)
+                        if ka == scalar(0.0) or kb == scalar(0.0):
+                            stiffness = m * (ka + kb)
+                        quads_out[slot] = q
+                        weights_out[slot] = a
+                        normals_out[slot] = n
+                        gaps_out[slot] = d0
+                        activation_out[slot] = d_hat
+                        stiffness_out[slot] = stiffness
+                        coefficient_out[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
+                        share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
+                        share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
+                        slot += 1
+
+        return freeze_pairs
+
+    @wp.kernel(module=module)
+    def clear(first: int, values_out: wp.array(dtype=wp.int32)):
+        values_out[first + wp.tid()] = 0
+
+    @wp.kernel(module=module)
+    def count_incident(
+        span: Span, count: wp.array(dtype=wp.int32), quads: wp.array(dtype=wp.vec4i), degree: wp.array(dtype=int)
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                for s in range(4):
+                    wp.atomic_add(degree, quads[k][s], 1)
+
+    @wp.kernel(module=module)
+    def fill_incident(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        ends: wp.array(dtype=wp.int32),
+        degree: wp.array(dtype=wp.int32),
+        entries_out: wp.array(dtype=wp.int32),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                for s in range(4):
+                    v = quads[k][s]
+                    left = wp.atomic_add(degree, v, -1)
+                    entries_out[ends[v] - left] = k * 4 + s
+
+    @wp.kernel(module=module)
+    def sort_incident(first: int, ends: wp.array(dtype=wp.int32), entries: wp.array(dtype=wp.int32)):
+        """Puts a vertex's pairs in order, so that its sums do not depend on how threads raced to fill the list."""
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        for i in range(low + 1, ends[v]):
+            e = entries[i]
+            j = int(i)
+            while j > low and entries[wp.max(j - 1, 0)] > e:
+                entries[j] = entries[j - 1]
+                j -= 1
+            entries[j] = e
+
+    @wp.kernel(module=module)
+    def linearize(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        x_tilde: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        stiffness: wp.array(dtype=scalar),
+        coefficient: wp.array(dtype=scalar),
+        slip_threshold: scalar,
+        friction_out: wp.array(dtype=scalar),
+        hessian_out: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=vec3),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                q = quads[k]
+                a = weights[k]
+                n = normals[k]
+                move = a[0] * (x_tilde[q[0]] - x[q[0]]) + a[1] * (x_tilde[q[1]] - x[q[1]])
+                move += a[2] * (x_tilde[q[2]] - x[q[2]]) + a[3] * (x_tilde[q[3]] - x[q[3]])
+                delta = gaps[k] + wp.dot(n, move)
+                floor = scalar(barrier.EXTENSION) * gaps[k]
+                hessian_out[k] = stiffness[k] * bar.barrier_hessian(wp.max(delta, floor), activation[k])
+                f = stiffness[k] * bar.extended_gradient(delta, floor, activation[k])
+                # `force` is what the pair exerts, per unit of witness weight: barrier along n, friction across
+                force = -f * n
+                friction = scalar(0.0)
+                if coefficient[k] > scalar(0.0):
+                    u = a[0] * (x_tilde[q[0]] - x_start[q[0]]) + a[1] * (x_tilde[q[1]] - x_start[q[1]])
+                    u += a[2] * (x_tilde[q[2]] - x_start[q[2]]) + a[3] * (x_tilde[q[3]] - x_start[q[3]])
+                    u -= wp.dot(u, n) * n
+                    friction = -coefficient[k] * f * bar.smoothed_coulomb(wp.length(u), slip_threshold)
+                    force -= friction * u
+                friction_out[k] = friction
+                force_out[k] = force
+
+    @wp.kernel(module=module)
+    def gather(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        friction: wp.array(dtype=scalar),
+        share: wp.array(dtype=scalar),
+        hessian: wp.array(dtype=scalar),
+        force: wp.array(dtype=vec3),
+        rhs: wp.array(dtype=vec3),
+        diagonal_out: wp.array(dtype=mat33),
+    ):
+        """Adds the contact forces to the right-hand side and makes the block diagonal that dominates the contact Hessian."""
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        total = vec3()
+        d = mat33()
+        for i in range(low, ends[v]):
+            k = entries[i] // 4
+            w = weights[k][entries[i] % 4]
+            n = normals[k]
+            total += w * force[k]
+            scale = wp.abs(w) * share[k]
+            d += scale * (hessian[k] - friction[k]) * wp.outer(n, n)
+            f = scale * friction[k]
+            d[0, 0] = d[0, 0] + f
+            d[1, 1] = d[1, 1] + f
+            d[2, 2] = d[2, 2] + f
+        if ends[v] > low:
+            rhs[v] = rhs[v] + total
+        diagonal_out[v] = d
+
+    @wp.kernel(module=module)
+    def stretch(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        friction: wp.array(dtype=scalar),
+        hessian: wp.array(dtype=scalar),
+        response_out: wp.array(dtype=vec3),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                q = quads[k]
+                a = weights[k]
+                n = normals[k]
+                u = a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]]
+                response_out[k] = (hessian[k] - friction[k]) * wp.dot(n, u) * n + friction[k] * u
+
+    @wp.kernel(module=module)
+    def spread(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        response: wp.array(dtype=vec3),
+        y: wp.array(dtype=vec3),
+    ):
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        if ends[v] > low:
+            total = vec3()
+            for i in range(low, ends[v]):
+                total += weights[entries[i] // 4][entries[i] % 4] * response[entries[i] // 4]
+            y[v] = y[v] + total
+
+    @wp.kernel(module=module)
+    def pair_energy(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        stiffness: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=scalar),
+    ):
+        k = first + wp.tid()
+        energy_out[k] = scalar(0.0)
+        if k < count[0]:
+            energy_out[k] = stiffness[k] * bar.barrier(gaps[k], activation[k])
+
+    return SimpleNamespace(
+        total=total,
+        measure_vertex_triangle=measure("vertex_triangle", vertex_triangle_gap),
+        measure_edge_edge=measure("edge_edge", edge_edge_gap),
+        freeze_vertex_triangle=freeze("vertex_triangle"),
+        freeze_edge_edge=freeze("edge_edge"),
+        clear=clear,
+        count_incident=count_incident,
+        fill_incident=fill_incident,
+        sort_incident=sort_incident,
+        linearize=linearize,
+        gather=gather,
+        stretch=stretch,
+        spread=spread,
+        pair_energy=pair_energy,
+    )
+
+
+class ActivePairs:
+    """The barriers and friction of one outer iteration, and the contact operator that the linear solver applies.
+
+    kappa: (n,) barrier stiffness that a vertex brings to its pairs, N/m, 0 for kinematic vertices.
+    friction: (n,) Coulomb coefficient; a pair has the geometric mean of its two sides. slip_threshold: eps_v h in metres.
+    free: (n,) 1 for simulated, 0 for kinematic vertices.
+    """
+
+    def __init__(self, device: Device, real: Real, kappa: wp.array, friction: wp.array, free: wp.array, slip_threshold: float):
+        n = len(kappa)
+        self.device, self.real, self.kernels = device, real, kernels(real)
+        self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
+        self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; pairs found; of these vertex-triangle
+        self.closest = wp.zeros(2, dtype=real.scalar, device=device.warp)  # smallest gap of each kind, negative, m
+        self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
+        self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
+        self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
+        self.scalar = None  # the paper mode's scalar diagonal; this mode couples the vertices of a pair instead
+        self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
+        self._allocate(FIRST_PAIRS)
+
+    def _allocate(self, capacity: int) -> None:
+        real = self.real
+
+        def make(dtype):
+            return wp.zeros(capacity, dtype=dtype, device=self.device.warp)
+
+        self.capacity = capacity
+        self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
+        self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
+        self.coefficient, self.friction = make(real.scalar), make(real.scalar)
+        self.share, self.hessian = make(real.scalar), make(real.scalar)
+        self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
+        self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
+        self.energy_sum = Reducer(self.device, real, capacity)
+        self.generation += 1
+
+    def freeze(self, candidates: Candidates, x: wp.array) -> None:
+        """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Recordable.
+
+        Where they do not fit, `candidates.overflow` is set and the list is incomplete.
+        """
+        k, device = self.kernels, self.device
+        for slot, c in enumerate(candidates.lists):
+            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.found, c.closest]
+            device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
+            device.scan(c.found, c.ends)
+            c.largest.max(c.closest, self.closest, slot)
+        ends = [c.ends for c in candidates.lists]
+        device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
+        for c in candidates.lists:
+            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.ends, self.count]
+            inputs += [self.kappa, self.friction_of_vertex, self.free]
+            inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
+            inputs += [self.stiffness, self.coefficient, self.share]
+            device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
+        self._index()
+
+    def expect(self, x: wp.array, x_tilde: wp.array, fraction: wp.array | None = None) -> None:
+        """What is left of the motion x -> x~ of which each vertex made `fraction`: only the paper's mode needs to know."""
+
+    def grow(self) -> bool:
+        """Makes room for what overflowed; returns whether anything had to."""
+        found = int(self.count.numpy()[1])
+        if found <= self.capacity:
+            return False
+        self._allocate(found + found // 2)
+        return True
+
+    def _index(self) -> None:
+        """Lists each vertex's pairs, in order."""
+        k, device, n = self.kernels, self.device, len(self.degree)
+        device.launch(k.clear, n, [self.degree])
+        device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
+        device.scan(self.degree, self.ends)
+        device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, self.entries])
+        if device.is_cuda:
+            device.launch(k.sort_incident, n, [self.ends, self.entries])
+
+    def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:
+        """Forces at the iterate x~ added to rhs, and their Hessian and block diagonal there. Recordable.
+
+        x_start: positions at the start of the step, from which slip is measured.
+        """
+        k = self.kernels
+        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, self.coefficient]
+        here = [self.slip_threshold, self.friction, self.hessian, self.force]
+        self.device.launch_list(k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, *here])
+        self.gather(rhs)
+
+    def gather(self, rhs: wp.array) -> None:
+        """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
+        inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
+        self.device.launch(self.kernels.gather, len(self.ends), [*inputs, rhs, self.diagonal])
+
+    def apply(self, p: wp.array, y: wp.array) -> None:
+        """y += (contact Hessian) p, pair by pair and gathered per vertex. Recordable."""
+        k = self.kernels
+        inputs = [self.count, p, self.quads, self.weights, self.normals, self.friction, self.hessian, self.response]
+        self.device.launch_list(k.stretch, self.capacity, inputs)
+        self.device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
+
+    def energy(self, out: wp.array, slot: int) -> None:
+        """out[slot] = sum of kappa m b(d0) over the pairs, in joules. Recordable."""
+        self.device.launch(
+            self.kernels.pair_energy,
+            self.capacity,
+            [self.count, self.gaps, self.activation, self.stiffness, self.energies],
+        )
+        self.energy_sum.sum(self.energies, out, slot)

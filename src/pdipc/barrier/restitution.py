@@ -1,0 +1,246 @@
+"""Restitution: the speed at which a pair parts after an impact (the eps of Eq. 6, for forces instead of position targets).
+
+A position target cannot promise a rebound: the end velocity then depends on where in the step the impact falls. Here positions are
+those of the barrier, and the velocities at the end of the step are corrected, as in the contact law of Newton and Moreau. With u the
+speed along the normal at which the two sides of an active pair part, before the step (u-) and after it (u),
+
+    u = -eps u-      where they approached, u- < 0,
+    u <= u-          where they parted already: a barrier that is still compressed moves them, but gives them no speed.
+
+The correction dv is the least one in the metric of the implicit step, which spreads an impulse over a stiff body:
+
+    min  |h dv|^2_M / (2 h^2) + Psi(x + h dv) - grad Psi(x) . h dv  +  sum_k w/2 (h n . sum_i a_i dv_i - ...)^2
+
+with weights w that are large against the bodies' masses. Local-global iterations solve it. Pairs push as a whole, so momentum is
+conserved. Should the kinetic energy afterwards exceed what the step had to give, dv is shortened.
+
+A body that sound does not cross within a step is not stopped at once, but springs back by itself. There the law would only make its
+surface rattle, and implicit Euler takes that energy away: the rebound would fall with eps. So the law holds for the part r of a pair,
+and for the rest the pair is left as it is for eps = 1 and comes to rest for eps = 0; r = q^2 / (1 + q^2), with q the time step over
+the time that sound needs to cross the softer body.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.barrier.pairs import ActivePairs
+from pdipc.device.launch import Device, Reducer, Span
+from pdipc.device.precision import Real
+
+SQUARE, CROSS, EXCESS, ELASTIC_START, ELASTIC_END = (wp.constant(place) for place in range(5))  # places of `sums`, J
+WEIGHT = 100.0  # of a pair's constraint, in units of the lighter body's mass / h^2
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def clear(first: int, needed_out: wp.array(dtype=wp.int32)):
+        needed_out[0] = 0
+
+    @wp.kernel(module=module)
+    def aim(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        v_start: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        body_mass: wp.array(dtype=scalar),
+        rigidity: wp.array(dtype=scalar),
+        restitution: scalar,
+        h: scalar,
+        target_out: wp.array(dtype=scalar),
+        pull_out: wp.array(dtype=scalar),
+        needed_out: wp.array(dtype=wp.int32),
+    ):
+        """Of each pair: the motion along the normal that it should have made by the end of the step, m, and its weight, N/m."""
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                q = quads[k]
+                before = scalar(0.0)
+                now = scalar(0.0)
+                for s in range(4):
+                    i = q[s]
+                    moved = x[i] - x_start[i]
+                    now += weights[k][s] * wp.dot(normals[k], moved)
+                    if free[i] > scalar(0.0):
+                        moved = h * v_start[i]
+                    before += weights[k][s] * wp.dot(normals[k], moved)
+                r = wp.min(rigidity[q[0]], rigidity[q[3]])
+                target = r * before + (scalar(1.0) - r) * (restitution * now + (scalar(1.0) - restitution) * before)
+                engaged = now > before
+                if before < scalar(0.0):
+                    target = restitution * ((scalar(1.0) - r) * now - r * before)
+                    engaged = True
+                target_out[k] = target
+                pull = scalar(0.0)
+                if engaged:
+                    ma = body_mass[q[0]]
+                    mb = body_mass[q[3]]
+                    lighter = wp.min(ma, mb)
+                    if lighter == scalar(0.0):
+                        lighter = wp.max(ma, mb)
+                    pull = scalar(WEIGHT) * lighter / (h * h)
+                if pull > scalar(0.0):
+                    needed_out[0] = 1  # whoever writes, writes the same
+                pull_out[k] = pull
+
+    @wp.kernel(module=module)
+    def inertia(
+        first: int,
+        x_now: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        mass: wp.array(dtype=scalar),
+        free: wp.array(dtype=scalar),
+        elastic: wp.array(dtype=vec3),
+        h: scalar,
+        force_out: wp.array(dtype=vec3),
+        increment_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        force_out[i] = -free[i] * mass[i] / (h * h) * (x_now[i] - x[i]) - elastic[i]
+        increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+
+    @wp.kernel(module=module)
+    def linearize(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        x_now: wp.array(dtype=vec3),
+        target: wp.array(dtype=scalar),
+        pull: wp.array(dtype=scalar),
+        friction_out: wp.array(dtype=scalar),
+        hessian_out: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=vec3),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                moved = vec3()
+                for s in range(4):
+                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
+                friction_out[k] = scalar(0.0)
+                hessian_out[k] = pull[k]
+                force_out[k] = pull[k] * (target[k] - wp.dot(normals[k], moved)) * normals[k]
+
+    @wp.kernel(module=module)
+    def kinetic(
+        first: int,
+        x_start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        x_now: wp.array(dtype=vec3),
+        v_start: wp.array(dtype=vec3),
+        acceleration: wp.array(dtype=vec3),
+        mass: wp.array(dtype=scalar),
+        h: scalar,
+        square_out: wp.array(dtype=scalar),
+        cross_out: wp.array(dtype=scalar),
+        excess_out: wp.array(dtype=scalar),
+    ):
+        """Kinetic energy of v + s dv: s^2 square + s cross + ..., and how far it is at s = 0 above energy at the start plus work."""
+        i = first + wp.tid()
+        v = (x[i] - x_start[i]) / h
+        dv = (x_now[i] - x[i]) / h
+        square_out[i] = scalar(0.5) * mass[i] * wp.dot(dv, dv)
+        cross_out[i] = mass[i] * wp.dot(v, dv)
+        given = scalar(0.5) * wp.dot(v_start[i], v_start[i]) + h * wp.dot(acceleration[i], v)
+        excess_out[i] = mass[i] * (scalar(0.5) * wp.dot(v, v) - given)
+
+    @wp.kernel(module=module)
+    def limit(first: int, sums: wp.array(dtype=scalar), part_out: wp.array(dtype=scalar)):
+        """The largest s <= 1 with s^2 square + s cross + excess <= 0."""
+        square = sums[SQUARE]
+        cross = sums[CROSS]
+        excess = sums[EXCESS] + sums[ELASTIC_END] - sums[ELASTIC_START]
+        part = scalar(1.0)
+        if square + cross + excess > scalar(0.0):
+            part = scalar(0.0)
+            root = cross * cross - scalar(4.0) * square * excess
+            if root > scalar(0.0) and square > scalar(0.0):
+                part = wp.clamp((wp.sqrt(root) - cross) / (scalar(2.0) * square), scalar(0.0), scalar(1.0))
+        part_out[0] = part
+
+    @wp.kernel(module=module)
+    def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):
+        i = first + wp.tid()
+        x_now[i] = x[i] + part[0] * (x_now[i] - x[i])
+
+    return SimpleNamespace(
+        clear=clear, aim=aim, inertia=inertia, linearize=linearize, kinetic=kinetic, limit=limit, shorten=shorten
+    )
+
+
+class Restitution:
+    """Corrects the velocities at the end of a step. Everything is recordable.
+
+    body_mass: (n,) kg, the mass of each vertex's body, 0 where kinematic. rigidity: (n,) r of each vertex's body, 1 where
+    kinematic. restitution: eps in [0, 1]. h: s.
+    needed: (1,) int32 on the device, whether `aim` found a pair to correct. x_now: (n,) m, x + h dv.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        real: Real,
+        pairs: ActivePairs,
+        mass: wp.array,
+        free: wp.array,
+        body_mass: wp.array,
+        rigidity: wp.array,
+        restitution: float,
+        h: float,
+    ):
+        n = len(mass)
+        self.device, self.pairs, self.kernels = device, pairs, kernels(real)
+        self.mass, self.free, self.body_mass, self.rigidity = mass, free, body_mass, rigidity
+        self.restitution, self.h = real.scalar(restitution), real.scalar(h)
+        self.x_now, self.elastic, self.zero = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(3))
+        self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.energies = [wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(3)]
+        self.sums, self.part = (wp.zeros(size, dtype=real.scalar, device=device.warp) for size in (5, 1))
+        self.reducer = Reducer(device, real, n)
+
+    def aim(self, x_start: wp.array, x: wp.array, v_start: wp.array) -> None:
+        """Launches the targets of the active pairs; x_now starts at x."""
+        k, device, p = self.kernels, self.device, self.pairs
+        device.copy(self.x_now, x)
+        device.launch_serial(k.clear, [self.needed])
+        pairs = [p.count, p.quads, p.weights, p.normals]
+        motion = [x_start, x, v_start, self.free, self.body_mass, self.rigidity, self.restitution, self.h]
+        # `gaps` and `stiffness` of the pairs are of no further use in this step
+        device.launch_list(k.aim, p.capacity, [*pairs, *motion, p.gaps, p.stiffness, self.needed])
+
+    def inertia(self, x: wp.array, force_out: wp.array, increment_out: wp.array) -> None:
+        """Launches the force of M and of the elastic forces at x; and a zero start for the increment."""
+        inputs = [self.x_now, x, self.mass, self.free, self.elastic, self.h, force_out, increment_out]
+        self.device.launch(self.kernels.inertia, len(x), inputs)
+
+    def linearize(self, x_start: wp.array, rhs: wp.array) -> None:
+        """Adds the pairs' forces to rhs, and makes their Hessian and block diagonal."""
+        p = self.pairs
+        pairs = [p.count, p.quads, p.weights, p.normals]
+        inputs = [*pairs, x_start, self.x_now, p.gaps, p.stiffness, p.friction, p.hessian, p.force]
+        self.device.launch_list(self.kernels.linearize, p.capacity, inputs)
+        p.gather(rhs)
+
+    def limit(self, x_start: wp.array, x: wp.array, v_start: wp.array, acceleration: wp.array) -> None:
+        """Shortens the correction so that energy does not rise; elastic energies are in `sums` already."""
+        k, device, n = self.kernels, self.device, len(x)
+        inputs = [x_start, x, self.x_now, v_start, acceleration, self.mass, self.h]
+        device.launch(k.kinetic, n, [*inputs, *self.energies])
+        for values, place in zip(self.energies, (SQUARE, CROSS, EXCESS), strict=True):
+            self.reducer.sum(values, self.sums, place)
+        device.launch_serial(k.limit, [self.sums, self.part])
+        device.launch(k.shorten, n, [x, self.part, self.x_now])

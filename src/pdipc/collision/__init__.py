@@ -1,0 +1,1 @@
+"""Sections 6 and 7.2: distances, culling, continuous collision detection, truncation."""

@@ -1,0 +1,251 @@
+"""Candidate pairs: what culling leaves, with the distances that each pair must keep.
+
+A list of candidates stays in use for as long as every vertex stays near an end of the motion that the list was made for: some
+outer iterations and, at rest, many steps. Culling then costs one comparison a vertex.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.collision import distance, sieve
+from pdipc.collision.broad_phase import BroadPhase
+from pdipc.collision.surface import Surface
+from pdipc.device.launch import Device, Reducer, Span
+from pdipc.device.precision import Real
+
+REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
+REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as minimum separation, at most
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
+    module = real.module(__name__)
+    dist = distance.functions(real)
+
+    @wp.func
+    def limits(a: int, b: int, rest_distance: scalar, half_separation: wp.array(dtype=scalar), d_hat: scalar, same: bool):
+        """(xi, d_hat) of a pair: smaller for a pair of one body that is close in the rest shape, so that rest is at rest."""
+        xi = half_separation[a] + half_separation[b]
+        reach = d_hat
+        if same:
+            xi = wp.min(xi, scalar(REST_SEPARATION) * rest_distance)
+            reach = wp.min(reach, scalar(REST_FRACTION) * rest_distance - xi)
+        return vec2(xi, reach)
+
+    @wp.kernel(module=module)
+    def vertex_triangle_limits(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        triangles: wp.array(dtype=wp.vec3i),
+        body: wp.array(dtype=wp.int32),
+        rest: wp.array(dtype=vec3),
+        half_separation: wp.array(dtype=scalar),
+        d_hat: scalar,
+        quads_out: wp.array(dtype=wp.vec4i),
+        limits_out: wp.array(dtype=vec2),
+    ):
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                v = pairs[k][0]
+                t = triangles[pairs[k][1]]
+                quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
+                same = body[v] == body[t[0]]
+                rest_distance = scalar(0.0)
+                if same:
+                    rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
+                limits_out[k] = limits(v, t[0], rest_distance, half_separation, d_hat, same)
+
+    @wp.kernel(module=module)
+    def edge_edge_limits(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        edges: wp.array(dtype=wp.vec2i),
+        body: wp.array(dtype=wp.int32),
+        rest: wp.array(dtype=vec3),
+        half_separation: wp.array(dtype=scalar),
+        d_hat: scalar,
+        quads_out: wp.array(dtype=wp.vec4i),
+        limits_out: wp.array(dtype=vec2),
+    ):
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                a = edges[pairs[k][0]]
+                b = edges[pairs[k][1]]
+                quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
+                same = body[a[0]] == body[b[0]]
+                rest_distance = scalar(0.0)
+                if same:
+                    rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
+                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, d_hat, same)
+
+    @wp.kernel(module=module)
+    def clear(first: int, away_out: wp.array(dtype=wp.int32)):
+        for i in range(4):
+            away_out[i] = 0
+
+    @wp.kernel(module=module)
+    def depart(
+        first: int,
+        x0: wp.array(dtype=vec3),
+        x1: wp.array(dtype=vec3),
+        begin: wp.array(dtype=vec3),
+        end: wp.array(dtype=vec3),
+        margin: scalar,
+        away: wp.array(dtype=wp.int32),
+    ):
+        """away[0] and [1]: whether any x0 is more than the margin away from `begin`, and from `end`; away[2] and [3]: any x1."""
+        i = first + wp.tid()
+        # whoever writes, writes the same; a comparison with NaN is false: not near is away
+        if not (wp.length(x0[i] - begin[i]) <= margin):
+            away[0] = 1
+        if not (wp.length(x0[i] - end[i]) <= margin):
+            away[1] = 1
+        if not (wp.length(x1[i] - begin[i]) <= margin):
+            away[2] = 1
+        if not (wp.length(x1[i] - end[i]) <= margin):
+            away[3] = 1
+
+    @wp.kernel(module=module)
+    def decide(first: int, away: wp.array(dtype=wp.int32), needed_out: wp.array(dtype=wp.int32)):
+        needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
+
+    @wp.kernel(module=module)
+    def keep(
+        first: int,
+        x0: wp.array(dtype=vec3),
+        x1: wp.array(dtype=vec3),
+        begin_out: wp.array(dtype=vec3),
+        end_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        begin_out[i] = x0[i]
+        end_out[i] = x1[i]
+
+    return SimpleNamespace(
+        vertex_triangle_limits=vertex_triangle_limits,
+        edge_edge_limits=edge_edge_limits,
+        clear=clear,
+        depart=depart,
+        decide=decide,
+        keep=keep,
+    )
+
+
+class CandidateList:
+    """The candidate pairs of one kind, as vertex quadruples with their limits, and room for what is found out about each.
+
+    Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1). quads: (capacity,) vec4i. limits: (capacity,)
+    vec2 of minimum separation xi and activation distance d_hat, m. count: (1,) int32 on the device.
+    gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`.
+    """
+
+    def __init__(self, device: Device, real: Real, kind: str):
+        self.device, self.real, self.kind = device, real, kind
+
+    def allocate(self, count: wp.array, capacity: int) -> None:
+        """Arrays for `capacity` pairs, of which `count` are in use."""
+
+        def make(size: int, dtype) -> wp.array:
+            return wp.zeros(size, dtype=dtype, device=self.device.warp)
+
+        real, blocks = self.real, -(-capacity // self.device.block)
+        self.quads = self.limits = self.gaps = self.times = None  # the old ones are given back first
+        self.count, self.capacity = count, capacity
+        self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
+        self.gaps, self.times = make(capacity, real.scalar), make(capacity, wp.int32)
+        self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
+        self.largest = Reducer(self.device, real, blocks)
+
+
+class Candidates:
+    """The candidate pairs of a model: `vertex_triangle` and `edge_edge`, each a `CandidateList`.
+
+    Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
+    the device; what was listed is then incomplete, and the caller has to `grow` and list again.
+    needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        real: Real,
+        surface: Surface,
+        broad_phase: BroadPhase,
+        rest_positions: np.ndarray,
+        half_separation: wp.array,
+        activation_distance: float,
+        margin: float,
+    ):
+        n = len(rest_positions)
+        self.device, self.real, self.surface, self.broad_phase = device, real, surface, broad_phase
+        self.half_separation, self.activation_distance, self.margin = half_separation, activation_distance, margin
+        self.kernels = kernels(real)
+        self.rest = wp.array(rest_positions, dtype=real.vec3, device=device.warp)
+        self.begin = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        reach = half_separation.numpy() + (0.5 * activation_distance + margin)
+        self.reach = wp.array(reach, dtype=real.scalar, device=device.warp)
+        self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
+        self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.sieve = sieve.functions(real).Sieve()
+        self.sieve.begin, self.sieve.end, self.sieve.half_separation = self.begin, self.end, half_separation
+        self.sieve.reach = activation_distance + 2.0 * margin
+        self.overflow = broad_phase.overflow
+        self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
+        self.vertex_triangle, self.edge_edge = self.lists
+        self.generation = 0
+        self._allocate()
+        self.invalidate()
+
+    def _allocate(self) -> None:
+        for own, found in zip(self.lists, self.broad_phase.lists, strict=True):
+            if self.generation == 0 or own.capacity != len(found.pairs):
+                own.allocate(found.count, len(found.pairs))
+        self.generation += 1
+
+    def invalidate(self) -> None:
+        """Forgets the list: the next `check` asks for a new one."""
+        self.begin.fill_(1.0e30)
+        self.end.fill_(1.0e30)
+
+    def restructure(self, x: wp.array) -> None:
+        """Renews the structures of the culling around x; what they find does not depend on it."""
+        self.broad_phase.restructure(x, self.half_separation)
+
+    def grow(self) -> bool:
+        """Makes room for what overflowed; returns whether anything had to."""
+        if not self.broad_phase.grow():
+            return False
+        self._allocate()
+        self.invalidate()
+        return True
+
+    def cover(self, x0: wp.array, x1: wp.array) -> None:
+        """Lists every pair that can meet, or act, while each vertex stays within the margin of its way from x0 to x1, all of
+        them at the same fraction of it."""
+        self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
+        self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
+        common = [self.surface.body_of_vertex, self.rest, self.half_separation, self.activation_distance]
+        primitives = (self.surface.triangles, self.surface.edges)
+        for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
+            inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]
+            self.device.launch_list(getattr(self.kernels, f"{own.kind}_limits"), own.capacity, inputs)
+
+    def check(self, x0: wp.array, x1: wp.array) -> None:
+        """needed[0] = 0 if the list holds for the motion x0 -> x1, else 1.
+
+        It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
+        """
+        k = self.kernels
+        self.device.launch_serial(k.clear, [self.away])
+        inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), self.away]
+        self.device.launch(k.depart, len(x0), inputs)
+        self.device.launch_serial(k.decide, [self.away, self.needed])

@@ -1,0 +1,179 @@
+"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full."""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
+
+SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
+FIRST_PAIRS = 1024  # room of a list at first
+LARGEST_LIST = 2**31 - 1
+
+
+@wp.struct
+class Boxes:
+    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32, rounded outward.
+
+    At a fraction s of the way a thing is inside the box (1 - s) begin + s end.
+    """
+
+    begin_low: wp.array(dtype=wp.vec3)
+    begin_high: wp.array(dtype=wp.vec3)
+    end_low: wp.array(dtype=wp.vec3)
+    end_high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Box:
+    """One of `Boxes`."""
+
+    begin_low: wp.vec3
+    begin_high: wp.vec3
+    end_low: wp.vec3
+    end_high: wp.vec3
+
+
+@wp.func
+def load(boxes: Boxes, i: int) -> Box:
+    box = Box()
+    box.begin_low = boxes.begin_low[i]
+    box.begin_high = boxes.begin_high[i]
+    box.end_low = boxes.end_low[i]
+    box.end_high = boxes.end_high[i]
+    return box
+
+
+@wp.func
+def store(boxes: Boxes, i: int, box: Box):
+    boxes.begin_low[i] = box.begin_low
+    boxes.begin_high[i] = box.begin_high
+    boxes.end_low[i] = box.end_low
+    boxes.end_high[i] = box.end_high
+
+
+@wp.func
+def join(a: Box, b: Box) -> Box:
+    """The box around two."""
+    box = Box()
+    box.begin_low = wp.min(a.begin_low, b.begin_low)
+    box.begin_high = wp.max(a.begin_high, b.begin_high)
+    box.end_low = wp.min(a.end_low, b.end_low)
+    box.end_high = wp.max(a.end_high, b.end_high)
+    return box
+
+
+@wp.func
+def meet(a: Box, b: Box) -> bool:
+    """Whether they overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other."""
+    for axis in range(3):
+        if a.begin_low[axis] > b.begin_high[axis] and a.end_low[axis] > b.end_high[axis]:
+            return False
+        if a.begin_high[axis] < b.begin_low[axis] and a.end_high[axis] < b.end_low[axis]:
+            return False
+    return True
+
+
+def boxes(count: int, device: Device) -> Boxes:
+    """Room for `count` boxes; each is empty, and meets nothing."""
+    made = Boxes()
+    for name, value in (("begin_low", 3e38), ("begin_high", -3e38), ("end_low", 3e38), ("end_high", -3e38)):
+        setattr(made, name, wp.full(max(1, count), wp.vec3(value, value, value), dtype=wp.vec3, device=device.warp))
+    return made
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+    # Boxes are float32, as Warp's trees are. One rounding errs by less than 6e-8 of the coordinate; this is outward of that.
+    outward = wp.constant(1.2e-7)
+
+    @wp.func
+    def below(v: vec3) -> wp.vec3:
+        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+        return f - outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) - wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
+
+    @wp.func
+    def above(v: vec3) -> wp.vec3:
+        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+        return f + outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) + wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
+
+    @wp.kernel(module=module)
+    def vertex_boxes(
+        first: int,
+        x0: wp.array(dtype=vec3),
+        x1: wp.array(dtype=vec3),
+        reach: wp.array(dtype=scalar),
+        boxes_out: Boxes,
+    ):
+        i = first + wp.tid()
+        r = vec3(reach[i], reach[i], reach[i])
+        boxes_out.begin_low[i] = below(x0[i] - r)
+        boxes_out.begin_high[i] = above(x0[i] + r)
+        boxes_out.end_low[i] = below(x1[i] - r)
+        boxes_out.end_high[i] = above(x1[i] + r)
+
+    @wp.kernel(module=module)
+    def settle(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        capacity: int,
+        count: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        """count: entries in use; the most ever found, so that a later find, which fits, does not hide one that did not."""
+        total = ends[ends.shape[0] - 1]
+        count[0] = total
+        count[1] = wp.max(count[1], total)
+        if total > capacity or total < 0:
+            count[0] = 0
+            overflow[0] = 1
+
+    return SimpleNamespace(vertex_boxes=vertex_boxes, settle=settle)
+
+
+class PairList:
+    """Pairs of one kind: a few slots for each first primitive, and the packed list in order of the first, then the second.
+
+    pairs: vec2i. count: (2,) int32 on the device, pairs in use and the most found. Where the list is too short it is empty, and
+    `overflow` (1,) int32 is set.
+    """
+
+    def __init__(self, device: Device, kernels: SimpleNamespace, primitives: int, overflow: wp.array):
+        self.device, self.kernels, self.primitives, self.overflow = device, kernels, primitives, overflow
+        self.found = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
+        self.ends = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
+        self._room_for_slots(SLOTS)
+        self.pairs = wp.zeros(FIRST_PAIRS, dtype=wp.vec2i, device=device.warp)
+        self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
+
+    def _room_for_slots(self, each: int) -> None:
+        self.room, self.slots = each, None  # the old ones are given back first
+        self.slots = wp.zeros(max(1, self.primitives * each), dtype=wp.vec2i, device=self.device.warp)
+
+    def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
+        """Launches the search `find(first, *inputs, room, slots, found)`, which counts all and keeps what fits the slots, and
+        `pack`, which searches again where the slots did not hold all."""
+        device, common = self.device, [*inputs, self.room, self.slots, self.found]
+        device.launch(find, self.primitives, common, grain=64)
+        device.scan(self.found, self.ends)
+        device.launch_serial(self.kernels.settle, [self.ends, len(self.pairs), self.count, self.overflow])
+        device.launch(pack, self.primitives, [*common, self.ends, self.pairs, self.overflow], grain=16)
+
+    def grow(self) -> bool:
+        """Makes room for what was found; returns whether anything had to."""
+        found = max(int(self.count.numpy()[1]), int(self.found.numpy().sum(dtype=np.int64)))
+        if found > LARGEST_LIST:
+            raise MemoryError(f"{found} candidate pairs: the motion of a step or the activation distance is too large")
+        if found <= len(self.pairs):
+            return False
+        average = 2 * found // max(1, self.primitives)
+        if average > self.room:
+            self._room_for_slots(min(average, MOST_SLOTS))
+        del self.pairs  # freed before the larger one is made
+        self.pairs = wp.zeros(min(found + found // 4, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
+        return True

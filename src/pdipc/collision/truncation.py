@@ -1,0 +1,223 @@
+"""Truncation of the motion x -> x~ so that nothing meets (Algorithm 1, lines 13 to 15), vertex by vertex.
+
+Every pass runs conservative CCD on the linear motion from x to the float positions that would be committed. Vertices of pairs
+that meet are shortened by the pair's time, candidates are listed again where that takes vertices out of the motion that the list
+was made for, and the pass is repeated with a smaller back-off until one finds no hit: that pass proves the positions that are
+committed.
+
+The paper truncates every vertex by the one smallest time (`per_vertex=False`): correct, but one collision anywhere then
+drags every body of the scene (docs/paper_map.md).
+"""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.collision import ccd
+from pdipc.collision.candidates import Candidates
+from pdipc.device.launch import Device, Span
+from pdipc.device.precision import Real, kernel
+
+UNIT = 1 << 30  # times are kept as integers over this unit, rounded down: the least of several is then exact and race-free
+FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
+LATER_BACKOFF = 0.1  # in the passes that check shortened motions
+SHRINK = 0.9
+MAX_PASSES = 30
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
+    module = real.module(__name__)
+    c = ccd.functions(real)
+    unit = wp.constant(UNIT)
+
+    def sweep(kind: str):
+        edge_edge = kind == "edge_edge"
+
+        @kernel(module, f"sweep_{kind}")
+        def sweep_pairs(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
+            x: wp.array(dtype=vec3),
+            x_end: wp.array(dtype=vec3),
+            fraction: wp.array(dtype=scalar),
+            passes: wp.array(dtype=wp.int32),
+            quads: wp.array(dtype=wp.vec4i),
+            limits: wp.array(dtype=vec2),
+            time_out: wp.array(dtype=wp.int32),
+            hits_out: wp.array(dtype=wp.int32),
+        ):
+            worker = span.first + wp.tid()
+            backoff = scalar(FIRST_BACKOFF)
+            if passes[0] > 0:
+                backoff = scalar(LATER_BACKOFF)
+            for begin in range(worker * span.block, count[0], span.step * span.block):
+                hits = int(0)
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    q = quads[k]
+                    time = unit
+                    shortest = wp.min(wp.min(fraction[q[0]], fraction[q[1]]), wp.min(fraction[q[2]], fraction[q[3]]))
+                    if passes[0] == 0 or shortest < scalar(1.0):
+                        xi = limits[k][0]
+                        t = scalar(2.0)
+                        if wp.static(edge_edge):
+                            t = c.edge_edge(
+                                x[q[0]], x[q[1]], x[q[2]], x[q[3]],
+                                x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], xi, backoff, limits[k][1],
+                            )  # fmt: skip
+                        else:
+                            t = c.vertex_triangle(
+                                x[q[0]], x[q[1]], x[q[2]], x[q[3]],
+                                x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], xi, backoff, limits[k][1],
+                            )  # fmt: skip
+                        if t <= scalar(1.0):
+                            time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
+                            hits += 1
+                    time_out[k] = time
+                hits_out[begin // span.block] = hits
+
+        return sweep_pairs
+
+    @wp.kernel(module=module)
+    def reset(first: int, multiplier_out: wp.array(dtype=wp.int32), any_hit_out: wp.array(dtype=wp.int32)):
+        i = first + wp.tid()
+        multiplier_out[i] = unit
+        if i == 0:
+            any_hit_out[0] = 0
+
+    @wp.kernel(module=module)
+    def spread(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        times: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.int32),
+        multiplier: wp.array(dtype=wp.int32),
+        any_hit: wp.array(dtype=wp.int32),
+    ):
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            if hits[begin // span.block] > 0:
+                any_hit[0] = 1
+                for k in range(begin, wp.min(begin + span.block, count[0])):
+                    if times[k] < unit:
+                        for s in range(4):
+                            wp.atomic_min(multiplier, quads[k][s], times[k])
+
+    @wp.kernel(module=module)
+    def together(first: int, begin: wp.array(dtype=int), end: wp.array(dtype=int), multiplier: wp.array(dtype=wp.int32)):
+        """Vertices of a rigid obstacle keep one time, so that it stays rigid."""
+        r = first + wp.tid()
+        least = unit
+        for i in range(begin[r], end[r]):
+            least = wp.min(least, multiplier[i])
+        for i in range(begin[r], end[r]):
+            multiplier[i] = least
+
+    @wp.kernel(module=module)
+    def shorten(
+        first: int,
+        multiplier: wp.array(dtype=wp.int32),
+        passes: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        x_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        x_end_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        if multiplier[i] < unit:
+            shrink = scalar(1.0)
+            if passes[0] > 0:
+                shrink = scalar(SHRINK)
+            fraction[i] = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
+            x_end_out[i] = x[i] + fraction[i] * (x_tilde[i] - x[i])
+        if passes[0] >= MAX_PASSES:
+            # Not settled: nobody moves. Always feasible, and the next outer iteration starts from a stronger barrier.
+            fraction[i] = scalar(0.0)
+            x_end_out[i] = x[i]
+
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        any_hit: wp.array(dtype=wp.int32),
+        passes: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        going_out[0] = 0
+        if any_hit[0] == 1:
+            if passes[0] < MAX_PASSES:
+                going_out[0] = 1
+            passes[0] = passes[0] + 1
+
+    @wp.kernel(module=module)
+    def begin_pass(
+        first: int,
+        x_tilde: wp.array(dtype=vec3),
+        fraction_out: wp.array(dtype=scalar),
+        x_end_out: wp.array(dtype=vec3),
+        passes_out: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        fraction_out[i] = scalar(1.0)
+        x_end_out[i] = x_tilde[i]
+        if i == 0:
+            passes_out[0] = 0
+            going_out[0] = 1
+
+    return SimpleNamespace(
+        sweep_vertex_triangle=sweep("vertex_triangle"),
+        sweep_edge_edge=sweep("edge_edge"),
+        reset=reset,
+        spread=spread,
+        together=together,
+        shorten=shorten,
+        decide=decide,
+        begin_pass=begin_pass,
+    )
+
+
+class Truncation:
+    """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
+
+    rigid: (first, last) vertex ranges of obstacles that must stay rigid. x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
+    that each vertex keeps; passes: (1,) int32 on the device.
+    """
+
+    def __init__(self, device: Device, real: Real, n: int, rigid: list[tuple[int, int]], per_vertex: bool = True):
+        self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
+        self.kernels = kernels(real)
+        self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
+        self.fraction = wp.zeros(n, dtype=real.scalar, device=device.warp)
+        self.x_end = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        ranges = rigid if per_vertex else [(0, n)]
+        self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
+        self.rigid_end = wp.array(np.array([last for _, last in ranges], dtype=np.int32), device=device.warp)
+        self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
+
+    def truncate(self, candidates: Candidates, x: wp.array, x_tilde: wp.array) -> None:
+        """Fills x_end and `passes`, the number of passes that found hits: 0 where the whole motion is free. Recordable."""
+        k, device, n = self.kernels, self.device, self.n
+        device.launch(k.begin_pass, n, [x_tilde, self.fraction, self.x_end, self.passes, self.going])
+
+        def sweep() -> None:
+            device.launch(k.reset, n, [self.multiplier, self.any_hit])
+            for c in candidates.lists:
+                inputs = [c.count, x, self.x_end, self.fraction, self.passes, c.quads, c.limits, c.times, c.found]
+                device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
+                inputs = [c.count, c.quads, c.times, c.found, self.multiplier, self.any_hit]
+                device.launch_scatter(k.spread, c.capacity, inputs)
+            device.when(self.any_hit, shorten)
+            device.launch_serial(k.decide, [self.any_hit, self.passes, self.going])
+
+        def shorten() -> None:
+            if len(self.rigid_begin):
+                device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
+            device.launch(k.shorten, n, [self.multiplier, self.passes, x, x_tilde, self.fraction, self.x_end])
+            candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
+            device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
+
+        device.loop(self.going, sweep)

@@ -1,0 +1,393 @@
+"""Running kernels: on CUDA as they are, on the CPU split over threads, and both as recorded graphs.
+
+Warp runs a CPU launch on one core and releases Python's lock while it does. So on the CPU each launch is cut into one range a
+thread. A recorded graph goes further: every thread replays a graph of its own ranges in native code, and the threads meet at a
+spin barrier after each kernel, which costs about a microsecond where a hand-over through Python costs sixty. Kernels never
+depend on how a range was cut, so results are the same to the last bit for any number of threads, captured or not.
+
+Two kinds of kernels:
+- over a known range: the first parameter is `first: int`, the index is `first + wp.tid()`; `Device.launch`.
+- over a list whose length is on the device: the first parameter is `span: Span` and the loop is
+      worker = span.first + wp.tid()
+      for block in range(worker * span.block, count, span.step * span.block):
+          for i in range(block, wp.min(block + span.block, count)):
+  `Device.launch_list`.
+"""
+
+import functools
+import itertools
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+from pdipc.device.precision import Real
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+def one_at_a_time(function: Callable) -> Callable:
+    """Decorator for what launches or records: callers in several threads take turns.
+
+    Warp has one recording at a time, and takes into it what any thread launches. A launch uses all cores anyway.
+    """
+
+    @functools.wraps(function)
+    def taking_turns(*args: Any, **kwargs: Any) -> Any:
+        with _ONE_AT_A_TIME:
+            return function(*args, **kwargs)
+
+    return taking_turns
+
+
+SCAN_BLOCK = 256  # numbers that a block of CUDA threads scans together
+REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads
+CPU_BLOCK = 64  # list entries that one CPU thread takes at a time
+CUDA_BLOCK = 1
+CPU_SPLIT = 2048  # ranges shorter than this stay on one CPU thread when launched from Python
+GRAPH_SPLIT = 256  # likewise inside a recorded graph, where splitting is cheaper
+CUDA_WORKERS = 1 << 17  # threads that share a list on CUDA
+
+
+@wp.struct
+class Span:
+    """How a list is shared: worker `first + tid` takes every `step`-th block of `block` entries."""
+
+    first: int
+    step: int
+    block: int
+
+
+# The first thread to arrive waits for the others. Spinning is what makes it cheap; after a while it yields, so that a
+# machine with more threads than free cores still makes progress.
+_MEET = """
+    int sched_yield_(void) __asm__("sched_yield");
+    int* arrived = &meeting[0];
+    int* generation = &meeting[16];
+    int now = __atomic_load_n(generation, __ATOMIC_ACQUIRE);
+    if (__atomic_add_fetch(arrived, 1, __ATOMIC_ACQ_REL) == threads) {
+        __atomic_store_n(arrived, 0, __ATOMIC_RELAXED);
+        __atomic_add_fetch(generation, 1, __ATOMIC_ACQ_REL);
+    } else {
+        int spins = 0;
+        while (__atomic_load_n(generation, __ATOMIC_ACQUIRE) == now) {
+            if (++spins > 2000) { sched_yield_(); }
+        }
+    }
+"""
+
+
+@functools.cache
+def _meet_kernel() -> wp.Kernel:
+    module = wp.get_module(f"{__name__}.meet")
+    module.options["enable_backward"] = False
+
+    @wp.func_native(_MEET)
+    def meet(meeting: wp.array(dtype=wp.int32), threads: int): ...
+
+    @wp.kernel(module=module)
+    def meet_others(meeting: wp.array(dtype=wp.int32), threads: int):
+        meet(meeting, threads)
+
+    return meet_others  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+
+
+class Graph:
+    """A recorded sequence of launches, replayed by `launch()`."""
+
+    def __init__(self, device: "Device", graphs: list[Any], keep_alive: Any):
+        self._device = device
+        self._graphs = graphs
+        self._keep_alive = keep_alive
+
+    def launch(self) -> None:
+        """Replays the recorded kernels; on the CPU returns when all are done."""
+        others = [self._device._pool().submit(wp.capture_launch, graph) for graph in self._graphs[1:]]
+        wp.capture_launch(self._graphs[0])
+        for other in others:
+            other.result()
+
+
+class Device:
+    """Where a model lives and how its kernels are launched.
+
+    name: "cpu", "cuda:0", or None for CUDA where there is one, else the CPU.
+    threads: CPU threads; None for all cores this process may use (or the environment's PDIPC_THREADS).
+    """
+
+    def __init__(self, name: str | None = None, threads: int | None = None):
+        wp.init()
+        if name is None:
+            name = "cuda:0" if wp.is_cuda_available() else "cpu"
+        try:
+            self.warp = wp.get_device(name)
+        except Exception as error:
+            known = ", ".join(device.alias for device in wp.get_devices())
+            raise ValueError(f'device "{name}" is not available; this machine has: {known}') from error
+        self.name = self.warp.alias
+        self.is_cuda = self.warp.is_cuda
+        if threads is None:
+            threads = int(os.environ.get("PDIPC_THREADS", "0")) or len(os.sched_getaffinity(0))
+        self.threads = 1 if self.is_cuda else max(1, threads)
+        self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
+        self._recording: int | None = None  # the CPU thread whose graph is being recorded
+        self._meeting = None if self.is_cuda else wp.zeros(32, dtype=wp.int32, device=self.warp)
+
+    @functools.cached_property
+    def records_loops(self) -> bool:
+        """Whether a recorded graph may hold loops and conditions: on CUDA from toolkit and driver 12.4 on."""
+        return not self.is_cuda or wp.is_conditional_graph_supported()
+
+    def __deepcopy__(self, memo: dict) -> "Device":
+        return self
+
+    @functools.cache  # noqa: B019  (a device lives as long as the process)
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(max(1, self.threads - 1), thread_name_prefix="pdipc")
+
+    def _meet(self) -> None:
+        if self.threads > 1:
+            wp.launch(_meet_kernel(), dim=1, inputs=[self._meeting, self.threads], device=self.warp)
+
+    def launch(self, kernel: wp.Kernel, dim: int, inputs: Sequence[Any], grain: int = 1) -> None:
+        """Runs `kernel(first, *inputs)` for indices 0 to dim - 1; each index is worth `grain` simple operations."""
+        if self.is_cuda:
+            wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
+        elif self._recording is not None:
+            parts = self.threads if dim * grain >= GRAPH_SPLIT else 1
+            part = self._recording
+            low, high = (dim * part) // parts, (dim * (part + 1)) // parts
+            if part < parts and high > low:
+                wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp)
+            self._meet()
+        elif self.threads == 1 or dim * grain < CPU_SPLIT:
+            wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
+        else:
+            bounds = [(dim * part) // self.threads for part in range(self.threads + 1)]
+            commands = [
+                wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp, record_cmd=True)
+                for low, high in itertools.pairwise(bounds)
+            ]
+            self._launch_together(commands)
+
+    def launch_list(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
+        """Runs `kernel(span, *inputs)` over a list of at most `capacity` entries whose length the kernel reads itself."""
+        if self.is_cuda:
+            workers = max(1, min(capacity, CUDA_WORKERS))
+            wp.launch(kernel, dim=workers, inputs=[_span(0, workers, CUDA_BLOCK), *inputs], device=self.warp)
+        elif self._recording is not None:
+            part, parts = self._recording, self.threads if capacity >= GRAPH_SPLIT else 1
+            if part < parts:
+                wp.launch(kernel, dim=1, inputs=[_span(part, parts, CPU_BLOCK), *inputs], device=self.warp)
+            self._meet()
+        elif self.threads == 1 or capacity < CPU_SPLIT:
+            wp.launch(kernel, dim=1, inputs=[_span(0, 1, CPU_BLOCK), *inputs], device=self.warp)
+        else:
+            parts = self.threads
+            commands = [
+                wp.launch(kernel, dim=1, inputs=[_span(part, parts, CPU_BLOCK), *inputs], device=self.warp, record_cmd=True)
+                for part in range(parts)
+            ]
+            self._launch_together(commands)
+
+    def _launch_together(self, commands: list[Any]) -> None:
+        """Runs recorded launches at once, one a thread."""
+        others = [self._pool().submit(command.launch) for command in commands[1:]]
+        commands[0].launch()
+        for other in others:
+            other.result()
+
+    def launch_serial(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
+        """Runs `kernel(0, *inputs)` once, in one thread: the last step of a sum, a counter, a decision."""
+        if self._recording is None or self._recording == 0:
+            wp.launch(kernel, dim=1, inputs=[0, *inputs], device=self.warp)
+        if self._recording is not None:
+            self._meet()
+
+    def launch_scatter(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
+        """Runs a kernel over a list that counts with integer atomics: in one thread on the CPU, where those are not atomic."""
+        if self.is_cuda:
+            self.launch_list(kernel, capacity, inputs)
+        else:
+            if self._recording is None or self._recording == 0:
+                wp.launch(kernel, dim=1, inputs=[_span(0, 1, CPU_BLOCK), *inputs], device=self.warp)
+            if self._recording is not None:
+                self._meet()
+
+    def copy(self, destination: wp.array, source: wp.array) -> None:
+        """Copies an array inside or outside of a recording."""
+        if self._recording is None or self._recording == 0:
+            wp.copy(destination, source)
+        if self._recording is not None:
+            self._meet()
+
+    def once(self, operation: Callable[[], None]) -> None:
+        """Runs, or records, what Warp does as one operation: a scan, the refit of a tree."""
+        if self._recording is None or self._recording == 0:
+            operation()
+        if self._recording is not None:
+            self._meet()
+
+    def scan(self, counts: wp.array, ends_out: wp.array) -> None:
+        """ends_out[i] = counts[0] + ... + counts[i], int32.
+
+        On CUDA by kernels of our own: Warp's scan allocates memory, which CUDA refuses inside the loops of a graph.
+        """
+        if self.is_cuda:
+            n = counts.size
+            k = scan_kernels()
+            wp.launch(
+                k["scan_blocks"],
+                -(-n // SCAN_BLOCK) * SCAN_BLOCK,
+                [n, counts, ends_out],
+                device=self.warp,
+                block_dim=SCAN_BLOCK,
+            )
+            wp.launch(k["scan_ends"], SCAN_BLOCK, [n, ends_out], device=self.warp, block_dim=SCAN_BLOCK)
+            wp.launch(k["add_ends"], n, [SCAN_BLOCK, ends_out], device=self.warp)
+        else:
+            self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
+
+    def loop(self, condition: wp.array, body: Callable[[], None]) -> None:
+        """Repeats `body` while the one int32 in `condition` is not zero; the body must launch before it changes that."""
+        wp.capture_while(condition, body)
+
+    def when(self, condition: wp.array, body: Callable[[], None]) -> None:
+        """Runs `body` if the one int32 in `condition` is not zero; the body must launch before it changes that."""
+        wp.capture_if(condition, body)
+
+    def capture(self, launches: Callable[[], None], keep_alive: Any = None) -> Graph:
+        """Records what `launches()` launches and returns it as a graph; nothing is run.
+
+        `launches` is called once for each CPU thread and must do the same each time. Kernels are compiled first where they
+        were not yet. Arrays used must stay allocated as long as the graph: pass what owns them as keep_alive.
+        """
+        if self.is_cuda:
+            with wp.ScopedCapture(device=self.warp) as capture:
+                launches()
+            return Graph(self, [capture.graph], (launches, keep_alive))
+        wp.load_module(_meet_kernel().module, device=self.warp)
+        graphs = []
+        try:
+            for part in range(self.threads):
+                self._recording = part
+                with wp.ScopedCapture(device=self.warp) as capture:
+                    launches()
+                graphs.append(capture.graph)
+        finally:
+            self._recording = None
+        return Graph(self, graphs, (launches, keep_alive))
+
+
+def _span(first: int, step: int, block: int) -> Any:
+    span = Span()
+    span.first, span.step, span.block = first, step, block
+    return span
+
+
+@functools.cache
+def scan_kernels() -> dict[str, wp.Kernel]:
+    """Inclusive sums in place of an array: within blocks, over the ends of blocks, then ends are added to the blocks after them.
+
+    The last number of each block is final after the second kernel, so no other memory is needed.
+    """
+    module = wp.get_module(f"{__name__}.scan")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module)
+    def scan_blocks(count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        value = int(0)
+        if i < count:
+            value = counts[i]
+        total = wp.untile(wp.tile_scan_inclusive(wp.tile(value)))
+        if i < count:
+            ends_out[i] = total
+
+    @wp.kernel(module=module)
+    def scan_ends(count: int, ends: wp.array(dtype=wp.int32)):
+        """Runs in one block of threads."""
+        lane = wp.tid()
+        size = wp.block_dim()
+        before = int(0)
+        for begin in range(0, count, size * size):
+            last = begin + (lane + 1) * size - 1
+            value = int(0)
+            if last < count:
+                value = ends[last]
+            values = wp.tile(value)
+            total = before + wp.untile(wp.tile_scan_inclusive(values))
+            if last < count:
+                ends[last] = total
+            before += wp.tile_extract(wp.tile_sum(values), 0)
+
+    @wp.kernel(module=module)
+    def add_ends(size: int, ends: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        if i >= size and i % size != size - 1:
+            ends[i] = ends[i] + ends[i // size * size - 1]
+
+    return {"scan_blocks": scan_blocks, "scan_ends": scan_ends, "add_ends": add_ends}  # pyright: ignore[reportReturnType]
+
+
+@functools.cache
+def kernels(real: Real) -> dict[str, wp.Kernel]:
+    """Sums and largest values that do not depend on the number of threads: fixed blocks, then one worker over the blocks."""
+    scalar = real.scalar
+    module = real.module(__name__)
+    block = wp.constant(REDUCE_BLOCK)
+
+    @wp.kernel(module=module)
+    def sum_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
+        b = first + wp.tid()
+        total = scalar(0.0)
+        for i in range(b * block, wp.min((b + 1) * block, count)):
+            total += values[i]
+        partial_out[b] = total
+
+    @wp.kernel(module=module)
+    def sum_partials(first: int, partial: wp.array(dtype=scalar), blocks: int, out: wp.array(dtype=scalar), slot: int):
+        total = scalar(0.0)
+        for b in range(blocks):
+            total += partial[b]
+        out[slot] = total
+
+    @wp.kernel(module=module)
+    def max_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
+        b = first + wp.tid()
+        largest = values[b * block]
+        for i in range(b * block, wp.min((b + 1) * block, count)):
+            largest = wp.max(largest, values[i])
+        partial_out[b] = largest
+
+    @wp.kernel(module=module)
+    def max_partials(first: int, partial: wp.array(dtype=scalar), blocks: int, out: wp.array(dtype=scalar), slot: int):
+        largest = partial[0]
+        for b in range(blocks):
+            largest = wp.max(largest, partial[b])
+        out[slot] = largest
+
+    return {"sum_blocks": sum_blocks, "sum_partials": sum_partials, "max_blocks": max_blocks, "max_partials": max_partials}  # pyright: ignore[reportReturnType]
+
+
+class Reducer:
+    """Adds up, or takes the largest of, `count` numbers in an array on the device; the result stays on the device."""
+
+    def __init__(self, device: Device, real: Real, count: int):
+        self.device, self.count = device, count
+        self.blocks = max(1, -(-count // REDUCE_BLOCK))
+        self.partial = wp.zeros(self.blocks, dtype=real.scalar, device=device.warp)
+        self.kernels = kernels(real)
+
+    def sum(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
+        """out[slot] = sum of values[0:count], always in the same order."""
+        self.device.launch(self.kernels["sum_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
+        self.device.launch_serial(self.kernels["sum_partials"], [self.partial, self.blocks, out, slot])
+
+    def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
+        """out[slot] = largest of values[0:count]."""
+        self.device.launch(self.kernels["max_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
+        self.device.launch_serial(self.kernels["max_partials"], [self.partial, self.blocks, out, slot])

@@ -1,0 +1,1 @@
+"""What judges a simulation and shares no code with it."""

@@ -1,0 +1,1 @@
+"""Section 5: A-Jacobi and its relatives."""

@@ -1,0 +1,1 @@
+"""Nonlinear solves inside Algorithm 1."""

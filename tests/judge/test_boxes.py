@@ -1,0 +1,30 @@
+"""Box overlap against brute force, with sizes over many orders of magnitude and with boxes that only touch."""
+
+import numpy as np
+import pytest
+
+from pdipc.judge import boxes
+
+
+def random_boxes(rng: np.random.Generator, count: int, on_grid: bool) -> tuple[np.ndarray, np.ndarray]:
+    if on_grid:
+        low = rng.integers(-5, 5, (count, 3)) * 0.25
+        return low, low + rng.integers(0, 4, (count, 3)) * 0.25
+    low = rng.normal(size=(count, 3))
+    return low, low + np.exp(rng.normal(-2, 2, (count, 1))) * rng.random((count, 3))
+
+
+@pytest.mark.parametrize("on_grid", [False, True])
+@pytest.mark.parametrize("seed", range(20))
+def test_overlapping_is_brute_force(seed, on_grid):
+    rng = np.random.default_rng(seed)
+    (low_a, high_a), (low_b, high_b) = (random_boxes(rng, count, on_grid) for count in rng.integers(1, 60, 2))
+    pairs = boxes.overlapping(low_a, high_a, low_b, high_b)
+    expected = np.argwhere(np.all((low_a[:, None] <= high_b) & (low_b <= high_a[:, None]), axis=2))
+    assert np.array_equal(pairs[np.lexsort(pairs.T[::-1])], expected)
+
+
+def test_one_huge_box_among_many_small_ones():
+    low = np.random.default_rng(0).random((20_000, 3))
+    pairs = boxes.overlapping(low, low + 1e-3, np.array([[-1e3] * 3]), np.array([[0.5] * 3]))
+    assert set(pairs[:, 0]) == set(np.flatnonzero(np.all(low <= 0.5, axis=1)))
