@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
-from contact.test_broad_phase import METHODS, sheet
 
+from collision.test_broad_phase import METHODS, sheet
 from pdipc.collision import broad_phase, distance, surface
 from pdipc.collision.candidates import Candidates
 from pdipc.device.launch import Device

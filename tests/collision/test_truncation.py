@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 from physics.scenes import cloth, floor, scene, solid
-from tests.contact import exact
 
 import pdipc
 from pdipc.drive import Work
+from tests.collision import exact
 
 
 def falling(truncation="per_vertex", precision="float64"):
