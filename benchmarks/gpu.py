@@ -193,6 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some parts: {', '.join(PARTS)}")
     parser.add_argument("--case", default="", help="only the cases whose name contains this")
     parser.add_argument("--seconds", type=float, default=BUDGET, help=f"absent: {BUDGET}")
+    parser.add_argument("--limit", type=float, help="most seconds a case; absent: as each part says")
     parser.add_argument(
         "--jobs", type=int, default=min(6, max(1, (os.cpu_count() or 1) // 2)), help="processes of checks at once"
     )
