@@ -80,13 +80,13 @@ def test_bundled_scenes_are_listed():
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["run", "nothing"], 1, "no such file"),
+        (["run", "nothing"], 2, "no such file"),
         (["run"], 2, "SCENE"),
         (["run", "squeeze", "--steps", "-1"], 2, "steps"),
         (["run", "squeeze", "--solver", "magic"], 2, "--solver"),
         (["run", "squeeze", "--resume", "--overwrite"], 2, "exclude each other"),
-        (["run", "squeeze", "-o", "nowhere", "--resume"], 1, "does not exist"),
-        (["check", "nowhere"], 1, "nowhere does not exist"),
+        (["run", "squeeze", "-o", "nowhere", "--resume"], 2, "does not exist"),
+        (["check", "nowhere"], 2, "nowhere does not exist"),
         (["render", "nowhere", "-o", "a.png", "--size", "big"], 2, "--size"),
         (["render", "nowhere", "-o", "a.png", "--size", "9000x100"], 2, "--size"),
         (["render", "nowhere", "-o", "a.png", "--view", "up"], 2, "--view"),
@@ -118,7 +118,7 @@ def test_run_passes_options_and_reports(fake, scene, tmp_path):
     assert open_run(out).frame_count == 5
 
     again = runner.invoke(app, ["run", str(scene), "-o", str(out)])
-    assert (again.exit_code, "--overwrite" in again.stderr) == (1, True)
+    assert (again.exit_code, "--overwrite" in again.stderr) == (2, True)
     assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--overwrite", "--steps", "1"]).exit_code == 0
     assert open_run(out).frame_count == 2
 
@@ -171,9 +171,9 @@ def test_resuming_with_another_scene_or_device_is_refused(fake, scene, tmp_path)
     out = tmp_path / "out"
     assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--steps", "2"]).exit_code == 0
     other = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--solver", "direct"])
-    assert (other.exit_code, "simulation.linear_solver differs" in other.stderr) == (1, True)
+    assert (other.exit_code, "simulation.linear_solver differs" in other.stderr) == (2, True)
     device = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--device", "cuda:0"])
-    assert (device.exit_code, "was run on cpu" in device.stderr) == (1, True)
+    assert (device.exit_code, "was run on cpu" in device.stderr) == (2, True)
     assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--steps", "5"]).exit_code == 0
     assert open_run(out).frame_count == 6
 

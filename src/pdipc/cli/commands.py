@@ -1,10 +1,14 @@
-"""The command line: run, check, certify, render, export, ... Errors are one message; exit codes 0 good, 1 failure, 2 usage."""
+"""The command line: run, check, certify, render, export, ...
+
+Errors are one message. Exit codes: 0 good, 1 failure, 2 usage, or input that cannot be read or simulated.
+"""
 
 import functools
 import os
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from enum import StrEnum
@@ -60,10 +64,20 @@ SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="A .toml or 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A run folder, as `pdipc run` writes it.")]
 
 
-def fail(message: str) -> NoReturn:
-    """Prints one message to stderr and ends with exit code 1."""
+def fail(message: str, code: int = 1) -> NoReturn:
+    """Prints one message to stderr and ends with an exit code."""
     typer.echo(f"pdipc: {message}", err=True)
-    raise typer.Exit(1)
+    raise typer.Exit(code)
+
+
+def _tell(message: Warning | str, category: type[Warning], *where: Any) -> None:
+    """Prints what a scene's files leave out as a line of its own; other warnings as Python does."""
+    from pdipc.scene.errors import SceneWarning
+
+    if issubclass(category, SceneWarning):
+        typer.echo(f"pdipc: note: {message}", err=True)
+    else:
+        typer.echo(warnings.formatwarning(message, category, *where[:2]), err=True, nl=False)
 
 
 def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
@@ -74,9 +88,12 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
         @functools.wraps(function)
         def guarded(*given: Any, **options: Any) -> None:
             from pdipc.output.results import RunError
+            from pdipc.scene.errors import SceneError
 
             try:
-                function(*given, **options)
+                with warnings.catch_warnings():
+                    warnings.showwarning = _tell
+                    function(*given, **options)
             except BrokenPipeError:
                 # the reader, such as `head`, has seen enough; nothing more can be printed, not even at exit
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -84,7 +101,7 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
             except (RunError, OSError, ValueError, IndexError) as error:  # SceneError is a ValueError
                 if "PDIPC_TRACEBACK" in os.environ:
                     raise
-                fail(str(error))
+                fail(str(error), 2 if isinstance(error, SceneError | RunError) else 1)
             except ImportError as error:
                 fail(_missing(error))
             except KeyboardInterrupt:
@@ -224,18 +241,26 @@ def load(scene: str) -> "Scene":
     """The scene of a file or bundled name, or that of a run folder."""
     from pdipc.scene.load import load_scene
 
+    return load_scene(scene_file(scene))
+
+
+def scene_file(scene: str) -> str | Path:
+    """The scene file of a run folder; anything else as it is."""
+    from pdipc.scene.meshes import is_file
+
     folder = Path(scene)
-    return load_scene(folder / "scene.json" if (folder / "run.json").is_file() else scene)
+    return folder / "scene.json" if is_file(folder / "run.json") else scene
 
 
 def _override(scene: "Scene", name: str, value: Any) -> None:
-    from pydantic import ValidationError
+    from pdipc.scene.errors import SceneError
 
     try:
         setattr(scene.simulation, name, value)
-    except ValidationError as error:
+    except SceneError as error:
         option = "solver" if name == "linear_solver" else name.replace("_", "-")
-        raise typer.BadParameter(f'"{value}": {error.errors()[0]["msg"]}', param_hint=f"--{option}") from None
+        said = str(error).partition(": ")[2]
+        raise typer.BadParameter(f'"{value}": {said}', param_hint=f"--{option}") from None
 
 
 def _same_scene(earlier: "Run", scene: "Scene", folder: Path) -> None:
@@ -395,14 +420,16 @@ def certify(folder: RunArgument) -> None:
 
 @command("check-scene")
 def check_scene(scene: SceneArgument) -> None:
-    """List everything that keeps a scene from being simulated; exit code 1 if there is anything."""
-    from pdipc.scene.check import check as find
+    """List everything that keeps a scene from being simulated; exit code 2 if something cannot be read, else 1 if there is anything."""
+    from pdipc.scene.check import check_file
 
-    findings = find(load(scene))
+    findings, notes = check_file(scene_file(scene))
+    for note in notes:
+        typer.echo(f"note: {note}")
     for finding in findings:
         typer.echo(f"- {finding}")
     if findings:
-        fail(f"{scene}: {len(findings)} to put right")
+        fail(f"{scene}: {len(findings)} to put right", 1 if all(finding.readable for finding in findings) else 2)
     typer.echo(f"{scene}: can be simulated")
 
 

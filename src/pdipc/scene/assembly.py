@@ -1,5 +1,8 @@
 """A scene as arrays: one numbering of all vertices, simulated and kinematic, and what is known about them."""
 
+import itertools
+import math
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -9,7 +12,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pdipc.scene import meshes
-from pdipc.scene.errors import SceneError
+from pdipc.scene.errors import SceneError, SceneWarning
+from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import Mesh
 from pdipc.scene.motion import Trajectory, rotation_matrix
 from pdipc.scene.schema import (
@@ -27,8 +31,10 @@ from pdipc.scene.schema import (
     VertexForce,
     Wind,
 )
+from pdipc.scene.worker import Worker
 
 ACTIVATION_PART = 1e-3  # default activation distance, of the scene size
+BYTES_PER_VERTEX, BYTES_PER_BODY = 230, 4000  # of memory to put a scene together, measured
 SEPARATION_PART = 0.02  # default minimum separation, of the activation distance
 
 
@@ -116,6 +122,7 @@ class Assembly:
     scene_size: L, the diagonal of the bounding box of all deformable bodies at the start, m.
     activation_distance: d_hat, m; 1e-3 L unless the scene says otherwise.
     minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
+    notes: what was left out of files, or converted, a line each.
     """
 
     positions: np.ndarray
@@ -130,6 +137,7 @@ class Assembly:
     attachments: list[AssembledAttachment] = field(default_factory=list)
     winds: list[AssembledWind] = field(default_factory=list)
     forces: list[AssembledForce] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def triangles(self) -> np.ndarray:
@@ -187,23 +195,26 @@ class Assembly:
         return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
 
 
-def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
+def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.ndarray]:
     """The mesh of a body or obstacle in its own coordinates, and its vertices at the start (n, 3), not yet placed.
 
-    Raises SceneError where it cannot be read or is of the wrong kind.
+    worker: reads files that other packages parse; None starts one where it is needed.
+    Raises SceneError where it cannot be read, is of the wrong kind, or needs more memory than there is.
     """
     where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
     source, start = placed.mesh, None
     try:
         if isinstance(source, str):
-            mesh = meshes.read(source)
+            mesh = meshes.read(source, worker)
         elif isinstance(source, Arrays):
             mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
             start = source.start
         else:
+            _need(source.bytes(), where, f"{source.cell_count()} cells", "fewer cells")
             mesh = source.mesh()
     except SceneError as error:
-        raise SceneError(f"{where}: {error}") from error
+        said = str(error)
+        raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
     if not isinstance(placed, Solid):
         if len(mesh.tets):
             mesh, start = mesh.surface(), None if start is None else start[np.unique(mesh.triangles)]
@@ -214,25 +225,64 @@ def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
                 "tetrahedralize = true"
             )
         mesh = meshes.tetrahedralize(mesh, where)
+    if isinstance(placed, Obstacle):
+        mesh = meshes.without_useless(mesh, where)
     return mesh, mesh.vertices if start is None else start
+
+
+def _read_all(
+    scene: Scene, problems: list[str], notes: list[str], unread: set[str]
+) -> list[tuple[Placed, Mesh, np.ndarray]]:
+    """Tables of bodies and obstacles, their meshes and starts; adds to `problems` and `unread` those that cannot be had."""
+    found = []
+    with Worker() as worker:
+        for placed in (*scene.bodies, *scene.obstacles):
+            where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
+            try:
+                mesh, start = load_mesh(placed, worker)
+                count = math.prod(placed.copies.counts) if isinstance(placed, Body) and placed.copies else 1
+                size = count * (BYTES_PER_BODY + BYTES_PER_VERTEX * len(start))
+                what = f"{count} copies of {len(start)} vertices" if count > 1 else f"{len(start)} vertices"
+                _need(size, where, what, "fewer copies" if count > 1 else "a coarser mesh")
+            except SceneError as error:
+                problems.append(str(error))
+                unread.add(placed.name)
+                continue
+            notes += [f"{where}: {note}" for note in mesh.notes]
+            found.append((placed, mesh, start))
+    return found
+
+
+def _need(size: int, where: str, what: str, right: str) -> None:
+    """Raises SceneError where `size` bytes are more than there are."""
+    free = free_memory()
+    if size > free:
+        raise SceneError(f"{where}: {what} need at least {gib(size)} of memory, and {gib(free)} are free; take {right}")
 
 
 def assemble(scene: Scene) -> Assembly:
     """Reads the meshes of `scene`, places them, and numbers everything.
 
     Raises SceneError with all meshes that cannot be read, and all names and indices that are unknown. What is wrong with the
-    geometry is for `pdipc.scene.check` to find.
+    geometry is for `pdipc.scene.check` to find. Warns (SceneWarning) of what was left out of files.
     """
     assembly, problems = gather(scene)
     if assembly is None or problems:
         listed = [f"the scene cannot be put together, {len(problems)} things to put right:", *problems]
         raise SceneError(problems[0] if len(problems) == 1 else "\n  ".join(listed))
+    for note in assembly.notes:
+        warnings.warn(note, SceneWarning, stacklevel=2)
     return assembly
 
 
-def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is found by the check
+def gather(
+    scene: Scene, left_out: Iterable[str] = (), numbers: dict[str, list[int]] | None = None
+) -> tuple[Assembly | None, list[str]]:
     """What `assemble` makes, of all that can be read and is known, and a line for each thing that is not.
 
+    left_out: names of bodies that the file has and `scene` lacks. numbers: the places in the file of the scene's attachments and
+    forces, where these are others; see `pdipc.scene.load.RightPart`.
     None where not a single body can be read. Raises TypeError for what is no `Scene`.
     """
     if not isinstance(scene, Scene):
@@ -240,16 +290,11 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
             f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use pdipc.Scene(**tables) or pdipc.load_scene(path)"
         )
     problems: list[str] = []
-    unread: set[str] = set()  # what refers to these is not judged
+    notes: list[str] = []
+    unread = set(left_out)  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
     first = 0
-    for placed in (*scene.bodies, *scene.obstacles):
-        try:
-            mesh, start = load_mesh(placed)
-        except SceneError as error:
-            problems.append(str(error))
-            unread.add(placed.name)
-            continue
+    for placed, mesh, start in _read_all(scene, problems, notes, unread):
         matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
         rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
         for name, offset in _copies(placed):
@@ -288,6 +333,7 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
         scene_size,
         activation_distance,
         minimum_separation,
+        notes=notes,
     )
     for body, placed, _, start, _ in parts:
         body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
@@ -302,11 +348,12 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
                     where += f".select = {pin.select}"
                     assembly.pins.append(AssembledPin(where, body.name, vertices, trajectory, pin.stiffness))
     assembly.velocities[assembly.kinematic_vertices] = 0.0
-    for number, attachment in enumerate(scene.attachments):
+    numbers = numbers or {}
+    for number, attachment in zip(numbers.get("attachments", itertools.count()), scene.attachments, strict=False):
         with _noting(problems):
             if _known(attachment.bodies, unread):
                 _attach(assembly, attachment, f"attachments[{number}]")
-    for number, force in enumerate(scene.forces):
+    for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
         with _noting(problems):
             if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
                 _force(assembly, force, f"forces[{number}]")
@@ -387,6 +434,8 @@ def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
             _in_range(body, [pair[side] for pair in table.pairs], where)
         pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
     else:
+        if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
+            return  # the check says so
         near = cKDTree(assembly.positions[b.first : b.last])
         distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
         chosen = np.flatnonzero(np.isfinite(distance))

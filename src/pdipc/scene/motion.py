@@ -25,8 +25,9 @@ class Trajectory:
         self.center = np.asarray(center if self.motion.center is None else self.motion.center, dtype=np.float64)
         self._times = np.array([keyframe.time for keyframe in self.motion.keyframes])
         self._translations = np.array([keyframe.translation for keyframe in self.motion.keyframes])
-        rotations = [keyframe.rotation for keyframe in self.motion.keyframes]
-        self._turn = Slerp(self._times, Rotation.from_euler("xyz", rotations, degrees=True)) if len(rotations) > 1 else None
+        self._angles = np.array([keyframe.rotation for keyframe in self.motion.keyframes])
+        shortest = self.motion.turns == "shortest" and len(self._angles) > 1
+        self._turn = Slerp(self._times, Rotation.from_euler("xyz", self._angles, degrees=True)) if shortest else None
 
     @property
     def is_static(self) -> bool:
@@ -42,15 +43,15 @@ class Trajectory:
             passed = max(0.0, (time if m.end is None else min(time, m.end)) - m.start)
             return Rotation.from_rotvec(passed * np.array(m.angular_velocity)).as_matrix(), passed * np.array(m.velocity)
         time = float(np.clip(time, self._times[0], self._times[-1]))
-        if self._turn is None:
-            return rotation_matrix(m.keyframes[0].rotation), self._translations[0]
-        if m.smooth:
+        if m.smooth and len(self._times) > 1:
             after = int(np.clip(np.searchsorted(self._times, time), 1, len(self._times) - 1))
             first, last = self._times[after - 1 : after + 1]
             part = (time - first) / (last - first)
             time = float(np.clip(first + (last - first) * part * part * (3 - 2 * part), first, last))
-        p = np.array([np.interp(time, self._times, column) for column in self._translations.T])
-        return self._turn(time).as_matrix(), p
+        p, angles = (
+            np.array([np.interp(time, self._times, column) for column in table.T]) for table in (self._translations, self._angles)
+        )
+        return rotation_matrix(angles) if self._turn is None else self._turn(time).as_matrix(), p
 
     def apply(self, points: np.ndarray, time: float) -> np.ndarray:
         """(n, 3) points of the start, m, at `time` s."""
