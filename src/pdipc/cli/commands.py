@@ -101,7 +101,10 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
             except (RunError, OSError, ValueError, IndexError) as error:  # SceneError is a ValueError
                 if "PDIPC_TRACEBACK" in os.environ:
                     raise
-                fail(str(error), 2 if isinstance(error, SceneError | RunError) else 1)
+                said, scene = str(error), str(options.get("scene", ""))
+                if isinstance(error, SceneError) and scene not in said:
+                    said = f'"{scene}": {said}'
+                fail(said, 2 if isinstance(error, SceneError | RunError) else 1)
             except ImportError as error:
                 fail(_missing(error))
             except KeyboardInterrupt:

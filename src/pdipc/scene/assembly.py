@@ -230,9 +230,7 @@ def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.nd
     return mesh, mesh.vertices if start is None else start
 
 
-def _read_all(
-    scene: Scene, problems: list[str], notes: list[str], unread: set[str]
-) -> list[tuple[Placed, Mesh, np.ndarray]]:
+def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[tuple[Placed, Mesh, np.ndarray]]:
     """Tables of bodies and obstacles, their meshes and starts; adds to `problems` and `unread` those that cannot be had."""
     found = []
     with Worker() as worker:

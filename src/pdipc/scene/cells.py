@@ -94,7 +94,7 @@ def _clip(points: np.ndarray) -> tuple[np.ndarray, bool]:
     flat = centered @ axes.T
     if np.cross(axes[0], axes[1]) @ normal < 0:
         flat = flat * [1.0, -1.0]
-    ring, triangles, crossed = list(range(n)), [], False
+    ring, triangles = list(range(n)), []
 
     def shape(k: int) -> float:
         """Twice the area over the longest side squared; at most 0 where the corner is no ear."""
@@ -114,18 +114,20 @@ def _clip(points: np.ndarray) -> tuple[np.ndarray, bool]:
         if quality[k] <= ROUNDING:
             quality = [shape(k) for k in range(len(ring))]  # what was in the way may be gone
             k = int(np.argmax(quality))
-            crossed |= quality[k] <= ROUNDING and _turns_back(flat[ring])
         triangles.append([ring[k - 1], ring[k], ring[(k + 1) % len(ring)]])
         del ring[k], quality[k]
         for near in (k - 1, k % len(ring)):
             quality[near] = shape(near)
-    return np.array([*triangles, ring]), crossed
+    return np.array([*triangles, ring]), _crosses(flat)
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _turns_back(flat: np.ndarray) -> bool:
-    """Whether what is left of a polygon has any area, so that it should have had an ear."""
-    return bool(np.abs(_cross(flat - flat[0], np.roll(flat, -1, axis=0) - flat[0])).max() > ROUNDING)
+def _crosses(ring: np.ndarray) -> bool:
+    """Whether two sides of a polygon (n, 2) cross within both."""
+    a, b = ring[:, None], np.roll(ring, -1, axis=0)[:, None]
+    side = _cross(b - a, ring - a)  # of each vertex from each side
+    parted = side * np.roll(side, -1, axis=1) < 0  # [i, j]: the line of side i parts the ends of side j
+    return bool(np.any(parted & parted.T))

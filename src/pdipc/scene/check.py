@@ -418,9 +418,22 @@ def _nearer(assembly: Assembly, primitives: list[np.ndarray], reach: np.ndarray,
             close = distances <= limits
             i, j = i[close], j[close]
             owners = np.sort(assembly.body_of_vertex[np.column_stack([i[:, 0], j[:, 0]])], axis=1)
-            found.append((distances[close], limits[close], owners, x[i].mean(axis=1)))
+            found.append((distances[close], limits[close], owners, _place(x[i], x[j]) if first is second else x[i][:, 0]))
     nothing = (np.zeros(0), np.zeros(0), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)))
     return tuple(np.concatenate(column) for column in zip(nothing, *found, strict=True))
+
+
+def _place(e: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """(n, 3) points of segments e that are nearest to segments f, both (n, 2, 3): ends, feet of the ends of f, or the crossing."""
+    u, v, w = e[:, 1] - e[:, 0], f[:, 1] - f[:, 0], e[:, 0] - f[:, 0]
+    uu, uv, vv, uw, vw = (np.einsum("ij,ij->i", a, b) for a, b in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    square = uu * vv - uv * uv
+    crossing = (uv * vw - vv * uw) / np.where(square > 0, square, 1.0)
+    feet = [np.einsum("ij,ij->i", f[:, k] - e[:, 0], u) / np.where(uu > 0, uu, 1.0) for k in (0, 1)]
+    parts = np.clip(np.column_stack([np.zeros(len(e)), np.ones(len(e)), *feet, crossing]), 0.0, 1.0)
+    points = e[:, :1] + parts[..., None] * u[:, None]
+    distances = [point_segment_distances(points[:, k], f[:, 0], f[:, 1]) for k in range(parts.shape[1])]
+    return points[np.arange(len(e)), np.argmin(distances, axis=0)] if len(e) else np.zeros((0, 3))
 
 
 def _vertex_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

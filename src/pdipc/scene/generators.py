@@ -114,7 +114,9 @@ class Torus(Shape):
     shape: Literal["torus"] = "torus"
     major_radius: Length = Field(default=0.5, description="Radius of the ring's centre line, m; larger than minor_radius.")
     minor_radius: Length = Field(default=0.2, description="Radius of its section, m.")
-    cells: tuple[Across, Annotated[Whole, Field(ge=3, le=4096)]] = Field(default=(4, 24), description="Cells across and around.")
+    cells: tuple[Across, Annotated[Whole, Field(ge=3, le=4096)]] = Field(
+        default=(4, 24), description="Cells across and around."
+    )
 
     def model_post_init(self, _) -> None:
         if self.minor_radius >= self.major_radius:

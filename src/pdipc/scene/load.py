@@ -64,6 +64,7 @@ def load_right_part(path: str | Path) -> RightPart:
     for _ in range(100):  # each round leaves something out, and few rounds find something new
         try:
             part.scene = Scene.model_validate(data, context={"folder": file.parent})
+            part.left_out -= {placed.name for placed in (*part.scene.bodies, *part.scene.obstacles)}
             return part
         except ValidationError as error:
             part.problems += [line for line in explain(error, data, Scene) if line not in part.problems]
@@ -86,7 +87,9 @@ def _tables(path: str | Path) -> tuple[Path, dict[str, Any]]:
     try:
         needed, free = BYTES_PER_BYTE * file.stat().st_size, free_memory()
         if needed > free:
-            raise SceneError(f'"{file}": needs about {gib(needed)} of memory, and {gib(free)} are free; put meshes in .npz files')
+            raise SceneError(
+                f'"{file}": needs about {gib(needed)} of memory, and {gib(free)} are free; put meshes in .npz files'
+            )
         text = file.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
         data = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
     except RecursionError as error:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pdipc.scene import mesh_files
+from pdipc.scene import files
 from pdipc.scene.cells import CELL_FACES, tetrahedra, triangulate
 from pdipc.scene.errors import SceneError
-from pdipc.scene.mesh_files import Contents
+from pdipc.scene.files.contents import CORNERS, Contents, lines_left_out
 from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
@@ -129,16 +129,18 @@ def read(name: str | Path, worker: Worker | None = None) -> Mesh:
     path = locate(str(name))
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise SceneError(f'mesh file "{_short(path)}": the format "{_short(suffix)}" is not known; allowed: {" ".join(SUFFIXES)}')
+        raise SceneError(
+            f'mesh file "{_short(path)}": the format "{_short(suffix)}" is not known; allowed: {" ".join(SUFFIXES)}'
+        )
     if not is_file(path):
         raise SceneError(f'mesh file "{_short(path)}": there is no such file')
     where = f'mesh file "{path}"'
     try:
-        if mesh_files.is_foreign(path):
+        if files.is_foreign(path):
             with contextlib.nullcontext(worker) if worker else Worker() as reader:
                 contents = reader.read(path)
         else:
-            contents = mesh_files.parse(path)
+            contents = files.parse(path)
         return from_contents(contents, where)
     except SceneError:
         raise
@@ -167,10 +169,10 @@ def from_contents(contents: Contents, where: str) -> Mesh:
     points = np.asarray(contents.points, dtype=np.float64)
     if points.ndim == 2 and points.shape[1] < 3:
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))  # what is flat lies in the plane of x and y
-    blocks: dict[str, list[np.ndarray]] = {kind: [] for kind in mesh_files.CORNERS}
+    blocks: dict[str, list[np.ndarray]] = {kind: [] for kind in CORNERS}
     higher: dict[str, int] = {}
     for kind, rows in contents.cells:
-        corners = mesh_files.CORNERS[kind]
+        corners = CORNERS[kind]
         if rows.ndim != 2 or rows.shape[1] < corners:
             name = {"tetra": "tets", "triangle": "triangles"}.get(kind, kind)
             raise SceneError(f"{where}: {name} have the shape {rows.shape}; they must be (m, {corners})")
@@ -273,7 +275,7 @@ def _lines(lines: np.ndarray, edges: np.ndarray) -> list[str]:
     edges = np.sort(edges.reshape(-1, 2), axis=1)
     _, number = np.unique(np.concatenate([edges, lines]), axis=0, return_inverse=True)
     loose = int(np.count_nonzero(~np.isin(number.ravel()[len(edges) :], number.ravel()[: len(edges)])))
-    return [mesh_files.lines_left_out(loose)] if loose else []
+    return [lines_left_out(loose)] if loose else []
 
 
 def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

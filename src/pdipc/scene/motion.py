@@ -49,7 +49,8 @@ class Trajectory:
             part = (time - first) / (last - first)
             time = float(np.clip(first + (last - first) * part * part * (3 - 2 * part), first, last))
         p, angles = (
-            np.array([np.interp(time, self._times, column) for column in table.T]) for table in (self._translations, self._angles)
+            np.array([np.interp(time, self._times, column) for column in table.T])
+            for table in (self._translations, self._angles)
         )
         return rotation_matrix(angles) if self._turn is None else self._turn(time).as_matrix(), p
 

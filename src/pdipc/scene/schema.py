@@ -80,7 +80,9 @@ class Simulation(Table):
         le=10**6,
         description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
     )
-    inner_iterations: Whole = Field(default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration.")
+    inner_iterations: Whole = Field(
+        default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration."
+    )
     linear_solver: Literal[
         "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
     ] = Field(
@@ -431,9 +433,7 @@ class Attachment(Table):
 class Copies(Table):
     """A body repeated in a grid; the copies are called `name[0]`, `name[1]`, ... with x running fastest, then y, then z."""
 
-    counts: tuple[Count, Count, Count] = Field(
-        default=(1, 1, 1), description="Copies along x, y, z."
-    )
+    counts: tuple[Count, Count, Count] = Field(default=(1, 1, 1), description="Copies along x, y, z.")
     spacing: Vector = Field(default=(1.0, 1.0, 1.0), description="From one copy to the next along x, y, z, m.")
 
 

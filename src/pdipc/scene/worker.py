@@ -20,7 +20,8 @@ import numpy as np
 import psutil
 
 from pdipc.scene.errors import SceneError
-from pdipc.scene.mesh_files import Contents, parse
+from pdipc.scene.files import parse
+from pdipc.scene.files.contents import Contents
 
 START_SECONDS = 10.0  # until Python has started and NumPy is there
 SECONDS, SECONDS_PER_MIB = 5.0, 1.0  # of work on a file: what parsers need, with their imports, several times over
@@ -42,8 +43,10 @@ class Worker:
         self._end()
 
     def read(self, path: Path) -> Contents:
-        """The contents of a mesh file, as `mesh_files.parse` gives them. Raises SceneError where it fails or takes too much."""
+        """The contents of a mesh file, as `files.parse` gives them. Raises SceneError where it fails or takes too much."""
         size = path.stat().st_size
+        if self.process is not None and self.process.poll() is not None:
+            self._end()
         if self.process is None and not self._start():
             return parse(path)  # a Python that cannot start another, such as one that is part of an application
         seconds, most = SECONDS + SECONDS_PER_MIB * size / 2**20, BYTES + BYTES_PER_BYTE * size
@@ -76,14 +79,15 @@ class Worker:
 
     def _ask(self, path: str | None, seconds: float, most: int) -> tuple[Contents | str | None, str]:
         """What the process answers, None where it is no more; and why it had to be ended, if it had."""
-        assert self.process is not None and self.process.stdin is not None and self.process.stdout is not None
+        running = self.process
+        assert running is not None and running.stdin is not None and running.stdout is not None
         done, too_much = threading.Event(), []
 
         def watch() -> None:
             begun, worked = time.monotonic(), None
             while not done.wait(LOOKING):
                 try:
-                    process = psutil.Process(self.process.pid)
+                    process = psutil.Process(running.pid)
                     used, work = process.memory_info().rss, sum(process.cpu_times()[:2])
                 except psutil.Error:
                     return
@@ -93,29 +97,30 @@ class Worker:
                 elif used > most:
                     too_much.append(f"it took more than {most / 2**30:.3g} GiB of memory")
                 if too_much:
-                    self.process.kill()
+                    running.kill()
                     return
 
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
         try:
             if path is not None:
-                self.process.stdin.write(json.dumps(path).encode() + b"\n")
-                self.process.stdin.flush()
-            return _receive(self.process.stdout), ""
+                running.stdin.write(json.dumps(path).encode() + b"\n")
+                running.stdin.flush()
+            return _receive(running.stdout), ""
         except (OSError, EOFError, ValueError):
             done.set()
             watcher.join()
             return None, too_much[0] if too_much else ""
         finally:
             done.set()
+            watcher.join()
 
     def _end(self) -> None:
         process, self.process = self.process, None
         if process is not None:
             process.kill()
             process.wait()
-            for pipe in (process.stdin, process.stdout):
+            for pipe in filter(None, (process.stdin, process.stdout)):
                 pipe.close()
 
 
@@ -160,7 +165,7 @@ def _limit_memory() -> None:
 
 def failed(path: Path, error: BaseException) -> str:
     """What to say where a parser raised `error`."""
-    said = " ".join(describe(error).split())
+    said = " ".join("".join(c if c.isprintable() else " " for c in describe(error)).split())
     said = said if len(said) <= 300 else said[:297] + "..."
     return f'mesh file "{path}": cannot be read as {path.suffix}: {said}'
 
@@ -183,7 +188,9 @@ def _send(file: BinaryIO, answer: Contents | str) -> None:
     arrays = {}
     if isinstance(answer, Contents):
         arrays = {"points": np.asarray(answer.points, dtype=np.float64)}
-        arrays |= {name: np.asarray(array, dtype=np.int64) for name, array in zip(("corners", "counts"), answer.polygons)}
+        arrays |= {
+            name: np.asarray(array, dtype=np.int64) for name, array in zip(("corners", "counts"), answer.polygons, strict=True)
+        }
         arrays |= {f"cells {k}": np.asarray(rows, dtype=np.int64) for k, (_, rows) in enumerate(answer.cells)}
         told = {"kinds": [kind for kind, _ in answer.cells], "notes": answer.notes, "repeats": answer.repeats}
     else:
