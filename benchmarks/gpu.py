@@ -109,8 +109,8 @@ def run_cases(part: str, cases: list[str], options: argparse.Namespace, out: Pat
         except Exception as error:
             traceback.print_exc()
             report.add(broken=f"{type(error).__name__}: {error}")
-            if place.is_cuda:  # after some errors nothing works any more in a process
-                sys.exit(1)
+            sys.stdout.flush()
+            os._exit(1)  # after some errors of CUDA nothing works any more in a process, not even its end
         finally:
             faulthandler.cancel_dump_traceback_later()
         report.add(ended=True, seconds=limit - report.left())
@@ -148,10 +148,11 @@ def start_cases(part: str, cases: list[str], options: argparse.Namespace, second
         rest = [case for case in cases if case not in over]
         if not rest:
             return printed
-        broken = next((case for case in rest if case in begun), rest[0])
-        Report(options.output / "gpu.jsonl", part, broken, 0.0).add(broken=error)
-        printed += f"  BROKEN {broken}: {error}\n"
-        cases = [case for case in rest if case != broken]
+        stuck = [case for case in rest if case in begun] or (rest[:1] if len(rest) == len(cases) else [])
+        for case in stuck:
+            Report(options.output / "gpu.jsonl", part, case, 0.0).add(broken=error)
+            printed += f"  BROKEN {case}: {error}\n"
+        cases = [case for case in rest if case not in stuck]
     for case in cases:
         Report(options.output / "gpu.jsonl", part, case, 0.0).add(skipped="no time left")
     return printed

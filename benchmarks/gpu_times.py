@@ -74,7 +74,7 @@ def time_scene(report, place: Device, case: str, carried: Path | None) -> None:
     first = time.perf_counter() - begun - built
     simulation.reset()
     results, times, asked = [], [], scene.simulation.steps
-    while len(results) < asked and report.left() > WITNESS_SECONDS:
+    while not results or (len(results) < asked and report.left() > WITNESS_SECONDS):
         start = time.perf_counter()
         results.append(simulation.step())
         times.append(1e3 * (time.perf_counter() - start))
