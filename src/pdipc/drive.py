@@ -12,6 +12,7 @@ from pdipc.barrier.pairs import ActivePairs
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.collision.candidates import Candidates
 from pdipc.collision.truncation import Truncation
+from pdipc.device import system
 from pdipc.device.launch import Graph, Reducer, one_at_a_time
 from pdipc.device.precision import Real
 from pdipc.integration.loads import Loads
@@ -33,20 +34,6 @@ STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND = (wp.constant(place) for place in 
 COUNTS = 5
 # What a step reports after its counts, in one array that the host reads once: iterations, residual, gap, then the stages' times.
 LOCAL_GLOBAL, LINEAR, RESIDUAL, GAP, FOREIGN, TIMES = (wp.constant(place) for place in range(COUNTS, COUNTS + 6))
-
-# The step is one graph, so its stages are timed where it runs.
-_CLOCK = """
-#if defined(__CUDA_ARCH__)
-    unsigned long long now;
-    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(now));
-    return double(now) * 1e-6;
-#else
-    struct { long long seconds, nanoseconds; } now;
-    int clock_gettime_(int, void*) __asm__("clock_gettime");
-    clock_gettime_(1, &now);
-    return double(now.seconds) * 1e3 + double(now.nanoseconds) * 1e-6;
-#endif
-"""
 
 
 @dataclass
@@ -278,21 +265,20 @@ def kernels(real: Real) -> SimpleNamespace:
         for stage in range(STARTED):
             report_out[TIMES + stage] = clock[stage]
 
-    @wp.func_native(_CLOCK)
-    def milliseconds() -> wp.float64: ...
+    milliseconds = system.milliseconds()  # the step is one graph, so its stages are timed where it runs
 
     @wp.kernel(module=module)
-    def start_clock(first: int, clock: wp.array(dtype=wp.float64)):
+    def start_clock(first: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         for i in range(clock.shape[0]):
             clock[i] = wp.float64(0.0)
-        now = milliseconds()
+        now = milliseconds(call, argument)
         clock[STARTED] = now
         clock[LAST] = now
 
     @wp.kernel(module=module)
-    def mark(first: int, stage: int, clock: wp.array(dtype=wp.float64)):
+    def mark(first: int, stage: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         """The time since the last mark belongs to `stage`."""
-        now = milliseconds()
+        now = milliseconds(call, argument)
         clock[stage] = clock[stage] + now - clock[LAST]
         clock[LAST] = now
 
@@ -408,7 +394,7 @@ class Work:
     def start(self) -> None:
         """Lines 1 to 3."""
         model, device, k, n = self.model, self.model.device, self.kernels, self.model.vertex_count
-        device.launch_serial(k.start_clock, [self.clock])
+        device.launch_serial(k.start_clock, [*system.clock_call(), self.clock])
         device.launch_serial(k.begin, [self.count, self.inner.done, model.solver.iterations, self.going])
         device.copy(self.x, self.x_start)
         start = [self.x_start, self.v_start, self.a_start, self.acceleration, self.target, model.free]
@@ -502,7 +488,7 @@ class Work:
         self.candidates.cover(self.x, self.x_tilde)
 
     def _mark(self, stage: str) -> None:
-        self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), self.clock])
+        self.model.device.launch_serial(self.kernels.mark, [STAGES.index(stage), *system.clock_call(), self.clock])
 
 
 @one_at_a_time

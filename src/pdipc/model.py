@@ -53,6 +53,7 @@ class State:
     time: float = 0.0
     step: int = 0
 
+    @one_at_a_time
     def copy(self) -> "State":
         """An independent copy."""
         return replace(
@@ -65,6 +66,7 @@ class State:
     def __deepcopy__(self, memo: dict) -> "State":
         return self.copy()
 
+    @one_at_a_time
     def arrays(self) -> dict[str, Any]:
         """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
         return {
@@ -139,6 +141,7 @@ class Model:
         zero = np.zeros_like(a.positions)
         return self.state_from({"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "time": 0.0})
 
+    @one_at_a_time
     def state_from(self, arrays: dict[str, Any]) -> State:
         """A state from NumPy arrays such as `State.arrays()` gives."""
 
