@@ -331,7 +331,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch, place):
         )
     else:
         monkeypatch.setattr(np, "save" if place == "frames" else "savez", refuse)
-    with pytest.raises(RunError, match="No space left on device.*make room, then go on with --resume"):
+    with pytest.raises(RunError, match=r"No space left on device.*make room, then go on with --resume"):
         runs.advance(writer, state, range(1, 3)) if place != "segments" else writer.append_segments(1, 0, state, state)
     monkeypatch.undo()
     writer.close()

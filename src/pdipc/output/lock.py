@@ -29,7 +29,7 @@ class Lock:
 
     def __init__(self, folder: Path):
         path = folder / NAME
-        self._file = open(path, "ab", buffering=0)
+        self._file = open(path, "ab", buffering=0)  # noqa: SIM115  (held for as long as the lock is)
         try:
             _take(self._file, path)
             self._file.truncate(0)

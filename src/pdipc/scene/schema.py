@@ -18,6 +18,7 @@ from pydantic import (
     StrictBool,
     Tag,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 
@@ -179,10 +180,15 @@ def _refuse_other_than_numbers(value: Any, width: int, needed: str) -> None:
                 raise ValueError(f"must be {needed}; [{row}][{column}] is {short(cell)}")
 
 
+def _rows_schema(kind: str, width: int) -> WithJsonSchema:
+    row = {"type": "array", "items": {"type": kind}, "minItems": width, "maxItems": width}
+    return WithJsonSchema({"type": "array", "items": row})
+
+
 _AS_LIST = PlainSerializer(lambda array: array.tolist(), return_type=list)
-Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST]
-Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST]
-Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST]
+Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST, _rows_schema("number", 3)]
+Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST, _rows_schema("integer", 3)]
+Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST, _rows_schema("integer", 4)]
 
 
 class Arrays(Table):
