@@ -27,6 +27,7 @@ from pdipc.cli import app
 from pdipc.output.results import open_run
 
 KINDS = ("INT", "TERM", "KILL", "writers", "limits")
+REFUSED = 2  # exit code of a run that cannot be
 CHECKPOINT_SECONDS = 0.03  # so that a run of a second has many
 
 
@@ -58,6 +59,8 @@ def start(arguments: list[str], log: Path, largest_file: int | None = None) -> i
         app(arguments)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(bool(end.code))
+    except KeyboardInterrupt:  # before the command line has begun
+        code = 128 + signal.SIGINT
     except BaseException:
         import traceback
 
@@ -136,7 +139,7 @@ def crowded(go: list[str], resume: list[str], log: Path, seconds: float, chance:
         children.append(start(resume, log))
         time.sleep(chance.choice([0.0, 0.0, chance.uniform(0.0, 0.3 * seconds)]))
     codes = [wait(child) for child in children]
-    if 0 not in codes or not set(codes) <= {0, 1}:
+    if 0 not in codes or not set(codes) <= {0, REFUSED}:
         return f"exit codes {codes}"
     return ""
 
@@ -145,7 +148,12 @@ def limited(go: list[str], resume: list[str], log: Path, chance: random.Random) 
     """A limit on files ends the run with the project's message; without it, the run goes on."""
     code = wait(start(go, log, largest_file=int(10 ** chance.uniform(2.0, 5.8))))
     said = log.read_text()
-    if code not in (0, 1) or (code == 1 and "cannot be written" not in said) or "Traceback" in said or "ignored" in said:
+    if (
+        code not in (0, REFUSED)
+        or (code == REFUSED and "cannot be written" not in said)
+        or "Traceback" in said
+        or "ignored" in said
+    ):
         return f"exit code {code}: {said[-300:]}"
     code = wait(start(resume if (Path(go[3]) / "run.json").exists() else go, log))
     return "" if code == 0 else f"exit code {code} in the end"
@@ -196,7 +204,7 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
             if differs:
                 wrong += 1
                 print(f"{kind}, run {i} of seed {seed}: {differs}\n{log.read_text()[-2000:]}", flush=True)
-            shutil.rmtree(run)
+            shutil.rmtree(run, ignore_errors=True)
             log.unlink()
         failures += wrong
         print(

@@ -21,7 +21,8 @@ from typing import Any
 
 import warp as wp
 
-from pdipc.device import system, threads
+from pdipc.device import system
+from pdipc.device import threads as shared
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
 
@@ -64,7 +65,7 @@ class Graph:
 
 def _together(parts: list[Callable[[], None]]) -> None:
     """Runs all parts at once, the first one here."""
-    others = [threads.pool(len(parts) - 1).submit(part) for part in parts[1:]]
+    others = [shared.pool(len(parts) - 1).submit(part) for part in parts[1:]]
     parts[0]()
     for other in others:
         other.result()
@@ -78,7 +79,7 @@ class Device:
     """
 
     @one_at_a_time
-    def __init__(self, name: str | None = None, thread_count: int | None = None):
+    def __init__(self, name: str | None = None, threads: int | None = None):
         wp.init()
         if name is None:
             name = "cuda:0" if wp.is_cuda_available() else "cpu"
@@ -89,11 +90,11 @@ class Device:
             raise ValueError(f'device "{name}" is not available; this machine has: {known}') from error
         self.name = self.warp.alias
         self.is_cuda = self.warp.is_cuda
-        self.threads = 1 if self.is_cuda else thread_count or threads.thread_count()
+        self.threads = 1 if self.is_cuda else threads or shared.thread_count()
         self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
         self._meeting = None if self.is_cuda else wp.zeros(system.MEETING, dtype=wp.int32, device=self.warp)
-        self._process = threads.process
+        self._process = shared.process
 
     @functools.cached_property
     def records_loops(self) -> bool:
@@ -105,7 +106,7 @@ class Device:
 
     def refuse_forked(self) -> None:
         """Raises ForkedError in a process that got the device over a fork, where that does not work."""
-        if self.is_cuda and self._process != threads.process:
+        if self.is_cuda and self._process != shared.process:
             raise ForkedError(
                 f"this was made on {self.name} before the process forked, and CUDA does not survive a fork; "
                 'start processes with multiprocessing\'s "spawn", and make simulations in them'
