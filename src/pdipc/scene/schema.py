@@ -173,7 +173,7 @@ def _refuse_other_than_numbers(value: Any, width: int, needed: str) -> None:
     if not isinstance(value, list | tuple):
         raise ValueError(f"must be a list of lists of {width} {needed}")
     for row, cells in enumerate(value):
-        if not isinstance(cells, list | tuple | np.ndarray):
+        if not isinstance(cells, list | tuple) and not (isinstance(cells, np.ndarray) and cells.ndim == 1):
             raise ValueError(f"must be a list of lists of {width} {needed}; [{row}] is {short(cells)}")
         for column, cell in enumerate(cells):
             if type(cell) is not float and type(cell) is not int and not isinstance(cell, np.integer | np.floating):
