@@ -105,7 +105,7 @@ class Model:
     half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness;
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
-    rigid: vertex ranges of the moving obstacles. triangles: (m, 3) int32, all surfaces.
+    rigid: vertex ranges of the obstacles that move without deforming. triangles: (m, 3) int32, all surfaces.
     """
 
     scene: Scene
@@ -255,7 +255,9 @@ def build(scene: Scene, device: str | None = None) -> Model:
         surface=skin,
         broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
-        rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
+        rigid=[
+            (b.first, b.last) for b in assembly.bodies if b.trajectory and b.trajectory.is_rigid and not b.trajectory.is_static
+        ],
         triangles=assembly.triangles,
     )
 

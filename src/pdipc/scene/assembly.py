@@ -13,15 +13,17 @@ from scipy.spatial import cKDTree
 
 from pdipc.scene import meshes
 from pdipc.scene.errors import SceneError, SceneWarning
+from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import Mesh
-from pdipc.scene.motion import Trajectory, rotation_matrix
+from pdipc.scene.motion import Deforming, Trajectory, rotation_matrix
 from pdipc.scene.schema import (
     Arrays,
     Attachment,
     Body,
     Cloth,
     ClothMaterial,
+    Deformation,
     Obstacle,
     Placed,
     Scene,
@@ -56,7 +58,7 @@ class AssembledBody:
     material: SolidMaterial | ClothMaterial | None
     half_separation: float
     friction: float
-    trajectory: Trajectory | None = None
+    trajectory: Trajectory | Deforming | None = None
 
     @property
     def kinematic(self) -> bool:
@@ -190,7 +192,7 @@ class Assembly:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         return pin.trajectory.apply(self.positions[pin.vertices], time)
 
-    def _scripts(self) -> list[tuple[np.ndarray, Trajectory]]:
+    def _scripts(self) -> list[tuple[np.ndarray, Trajectory | Deforming]]:
         obstacles = [(np.arange(b.first, b.last), b.trajectory) for b in self.bodies if b.trajectory is not None]
         return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
 
@@ -230,14 +232,54 @@ def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.nd
     return mesh, mesh.vertices if start is None else start
 
 
-def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[tuple[Placed, Mesh, np.ndarray]]:
-    """Tables of bodies and obstacles, their meshes and starts; adds to `problems` and `unread` those that cannot be had."""
+def load_deforming(placed: Obstacle, deformation: Deformation, worker: Worker | None = None) -> tuple[Mesh, Frames]:
+    """The mesh of an obstacle with a cache, with all vertices of its file, and the cache, not yet placed.
+
+    Raises SceneError where they cannot be read or do not go together.
+    """
+    where = f'obstacle "{placed.name}"'
+    source, cache = placed.mesh, deformation.cache
+    try:
+        if isinstance(cache, str):
+            frames, contents = read_frames(cache, deformation.frame_rate, worker)
+        else:
+            frames, contents = timed(cache.vertices, np.array(cache.times), deformation.frame_rate, "cache"), None
+        if isinstance(source, str):
+            path = meshes.locate(source)
+            if contents is None or source != cache:
+                contents = meshes.contents(path, worker, frames=True)
+            mesh = meshes.guarded(path, lambda: meshes.from_contents(contents, f'mesh file "{path}"', whole=True))
+        elif isinstance(source, Arrays):
+            mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
+        else:
+            _need(source.bytes(), where, f"{source.cell_count()} cells", "fewer cells")
+            mesh = source.mesh()
+        found, needed = frames.points.shape[1], len(mesh.vertices)
+        if found != needed:
+            raise SceneError(f"the cache has frames of {found} vertices; its mesh has {needed}, and each of them needs a place")
+    except SceneError as error:
+        said = str(error)
+        raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
+    first = Mesh(frames.points[0].astype(np.float64), mesh.triangles, notes=mesh.notes)
+    return meshes.without_useless(first, where), frames
+
+
+Read = tuple[Placed, Mesh, np.ndarray, Frames | None]  # a table, its mesh, where its vertices start, and its cache
+
+
+def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[Read]:
+    """All bodies and obstacles that can be had; adds the others to `problems` and `unread`."""
     found = []
     with Worker() as worker:
         for placed in (*scene.bodies, *scene.obstacles):
             where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
             try:
-                mesh, start = load_mesh(placed, worker)
+                frames = None
+                if isinstance(placed, Obstacle) and isinstance(placed.motion, Deformation):
+                    mesh, frames = load_deforming(placed, placed.motion, worker)
+                    start = mesh.vertices
+                else:
+                    mesh, start = load_mesh(placed, worker)
                 count = math.prod(placed.copies.counts) if isinstance(placed, Body) and placed.copies else 1
                 size = count * (BYTES_PER_BODY + BYTES_PER_VERTEX * len(start))
                 what = f"{count} copies of {len(start)} vertices" if count > 1 else f"{len(start)} vertices"
@@ -247,7 +289,7 @@ def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[s
                 unread.add(placed.name)
                 continue
             notes += [f"{where}: {note}" for note in mesh.notes]
-            found.append((placed, mesh, start))
+            found.append((placed, mesh, start, frames))
     return found
 
 
@@ -292,9 +334,13 @@ def gather(
     unread = set(left_out)  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
     first = 0
-    for placed, mesh, start in _read_all(scene, problems, notes, unread):
+    for placed, mesh, start, frames in _read_all(scene, problems, notes, unread):
         matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
         rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
+        deforming = None
+        if frames is not None:
+            deforming = Deforming(frames, placed.motion.start, matrix, placed.translation)
+            rest = start = deforming.apply(None, 0.0)
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
@@ -306,6 +352,7 @@ def gather(
                 placed.material if isinstance(placed, Solid | Cloth) else None,
                 half_separation=0.0,
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
+                trajectory=deforming,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):
@@ -336,7 +383,7 @@ def gather(
     for body, placed, _, start, _ in parts:
         body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
         if isinstance(placed, Obstacle):
-            body.trajectory = Trajectory(placed.motion, _middle(start))
+            body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
         else:
             for number, pin in enumerate(placed.pins):
                 where = f'body "{body.name}", pins[{number}]'

@@ -3,8 +3,10 @@
 import contextlib
 import importlib.util
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -127,6 +129,11 @@ def read(name: str | Path, worker: Worker | None = None) -> Mesh:
     Raises SceneError where the file is missing, has another format, cannot be read, or holds neither triangles nor tets.
     """
     path = locate(str(name))
+    return guarded(path, lambda: from_contents(contents(path, worker), f'mesh file "{path}"'))
+
+
+def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> Contents:
+    """What a mesh file holds, before it is cut; frames: with all frames. Raises SceneError as `read` does."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SceneError(
@@ -134,17 +141,23 @@ def read(name: str | Path, worker: Worker | None = None) -> Mesh:
         )
     if not is_file(path):
         raise SceneError(f'mesh file "{_short(path)}": there is no such file')
-    where = f'mesh file "{path}"'
+
+    def read() -> Contents:
+        if not files.is_foreign(path):
+            return files.parse(path, frames)
+        with contextlib.nullcontext(worker) if worker else Worker() as reader:
+            return reader.read(path, frames)
+
+    return guarded(path, read)
+
+
+def guarded(path: Path, reading: Callable[[], Any]) -> Any:
+    """What `reading` a file gives. Raises SceneError in place of whatever a damaged file leads to."""
     try:
-        if files.is_foreign(path):
-            with contextlib.nullcontext(worker) if worker else Worker() as reader:
-                contents = reader.read(path)
-        else:
-            contents = files.parse(path)
-        return from_contents(contents, where)
+        return reading()
     except SceneError:
         raise
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:
         raise SceneError(failed(path, error)) from error
 
 
@@ -160,12 +173,15 @@ def _short(text: object) -> str:
     return str(text) if len(str(text)) <= 300 else f"{str(text)[:300]}..."
 
 
-def from_contents(contents: Contents, where: str) -> Mesh:
+def from_contents(contents: Contents, where: str, whole: bool = False) -> Mesh:
     """A mesh of what a file holds: its cells cut into tets, else its polygons cut into triangles, and a note for what is left out.
 
+    whole: with all vertices of the file in their order, as frames have them; else only those that are used, and each place once.
     Raises SceneError where it holds neither.
     """
     notes = list(contents.notes)
+    if contents.frames is not None and not whole:
+        notes.append(f"it holds {len(contents.frames)} frames: the first was taken")
     points = np.asarray(contents.points, dtype=np.float64)
     if points.ndim == 2 and points.shape[1] < 3:
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))  # what is flat lies in the plane of x and y
@@ -208,7 +224,7 @@ def from_contents(contents: Contents, where: str) -> Mesh:
             notes.append(f"{len(tets) - len(kept)} tets that were there twice were left out")
             tets = tets[np.sort(kept)]
         notes += _lines(lines, tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]])
-        return replace(from_arrays(points, tets, None, where), notes=notes)
+        return replace(from_arrays(points, tets, None, where, drop_unused=not whole), notes=notes)
     small = counts < 3
     if small.any():
         notes.append(f"{np.count_nonzero(small)} faces of fewer than three corners were left out")
@@ -220,7 +236,7 @@ def from_contents(contents: Contents, where: str) -> Mesh:
         others = ", ".join(kind for kind in cells) or "none"
         raise SceneError(f"{where}: holds no triangles: cells of the kinds {others}; needed: tetra or other cells, or faces")
     notes += _lines(lines, triangles[:, [[0, 1], [1, 2], [2, 0]]])
-    points, merged = _merge(points)
+    points, merged = (points, None) if whole else _merge(points)
     if merged is not None:
         triangles = merged[triangles]
         if not contents.repeats:
@@ -229,7 +245,7 @@ def from_contents(contents: Contents, where: str) -> Mesh:
     if flat.any() and not flat.all():
         notes.append(f"{np.count_nonzero(flat)} triangles that have a corner twice were left out")
         triangles = triangles[~flat]
-    return replace(from_arrays(points, None, triangles, where), notes=notes)
+    return replace(from_arrays(points, None, triangles, where, drop_unused=not whole), notes=notes)
 
 
 def _tets(points: np.ndarray, kind: str, cells: np.ndarray) -> np.ndarray:

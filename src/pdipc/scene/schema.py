@@ -191,6 +191,23 @@ Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST, _rows_schema("in
 Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST, _rows_schema("integer", 4)]
 
 
+def _frames(value: Any) -> np.ndarray:
+    """(f, n, 3) numbers, in Python an array, in files lists."""
+    if not isinstance(value, np.ndarray):
+        if not isinstance(value, list | tuple):
+            raise ValueError("must be a list of frames, each a list of lists of 3 numbers")
+        for frame in value:
+            if not isinstance(frame, np.ndarray):
+                _refuse_other_than_numbers(frame, 3, "numbers")
+        try:
+            value = np.asarray(value, dtype=np.float64)
+        except (OverflowError, ValueError, TypeError) as error:
+            raise ValueError(f"must be numbers that 64 bits hold, and each frame of as many vertices: {error}") from None
+    if value.dtype.kind not in "iuf" or value.ndim != 3 or value.shape[2] != 3:
+        raise ValueError(f"has the shape {value.shape} and is {value.dtype}; must be numbers (f, n, 3)")
+    return value
+
+
 class Arrays(Table):
     """A mesh given by its numbers: tets for a solid, triangles for cloth and obstacles."""
 
@@ -469,10 +486,59 @@ class Cloth(Body):
     material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
 
 
-class Obstacle(Placed):
-    """A rigid surface, open or closed, that moves as told and feels nothing."""
+def _cache_kind(value: Any) -> str | None:
+    if isinstance(value, str | Path):
+        return "file"
+    return "framearrays" if isinstance(value, dict | FrameArrays) else None
 
-    motion: Motion | None = Field(default=None, description="How it moves; absent: not at all.")
+
+def _motion_kind(value: Any) -> str:
+    return "deformation" if isinstance(value, Deformation) or (isinstance(value, dict) and "cache" in value) else "motion"
+
+
+class FrameArrays(Table):
+    """Positions of all vertices of an obstacle over time, given by their numbers."""
+
+    vertices: Annotated[np.ndarray, BeforeValidator(_frames), _AS_LIST] = Field(description="V (f, n, 3): of each frame, m.")
+    times: list[Number] = Field(description="When each frame is there, s, ascending; counted from the first.")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FrameArrays) and self.times == other.times and np.array_equal(self.vertices, other.vertices)
+
+
+class Deformation(Table):
+    """All vertices of an obstacle over time: a cache, as animation programs write it. In between vertices go straight.
+
+    It stands and is scaled as the mesh is. Before its first frame and after its last it holds still.
+    """
+
+    cache: Annotated[
+        Annotated[_File, Tag("file")] | Annotated[FrameArrays, Tag("framearrays")],
+        Discriminator(
+            _cache_kind,
+            custom_error_type="cache",
+            custom_error_message="must be a file, a pattern of files, or a table with vertices and times",
+        ),
+    ] = Field(
+        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD), a pattern of files that are a frame each, "
+        "such as `body_*.obj`, or arrays; of as many vertices as the mesh has."
+    )
+    frame_rate: Positive | None = Field(
+        default=None, le=1e6, description="Frames a second; absent: at the times that the cache says."
+    )
+    start: NotNegative = Field(default=0.0, description="When its first frame is there, s.")
+
+
+class Obstacle(Placed):
+    """A surface, open or closed, that moves or deforms as told and feels nothing."""
+
+    motion: (
+        Annotated[
+            Annotated[Motion, Tag("motion")] | Annotated[Deformation, Tag("deformation")],
+            Discriminator(_motion_kind),
+        ]
+        | None
+    ) = Field(default=None, description="How it moves: rigidly, or with a cache of all its vertices; absent: not at all.")
 
 
 # --- forces ---

@@ -42,15 +42,15 @@ class Worker:
     def __exit__(self, *_) -> None:
         self._end()
 
-    def read(self, path: Path) -> Contents:
+    def read(self, path: Path, frames: bool = False) -> Contents:
         """The contents of a mesh file, as `files.parse` gives them. Raises SceneError where it fails or takes too much."""
         size = path.stat().st_size
         if self.process is not None and self.process.poll() is not None:
             self._end()
         if self.process is None and not self._start():
-            return parse(path)  # a Python that cannot start another, such as one that is part of an application
+            return parse(path, frames)  # a Python that cannot start another, such as one that is part of an application
         seconds, most = SECONDS + SECONDS_PER_MIB * size / 2**20, BYTES + BYTES_PER_BYTE * size
-        answer, too_much = self._ask(str(path.resolve()), seconds, most)
+        answer, too_much = self._ask({"path": str(path.resolve()), "frames": frames}, seconds, most)
         if answer is None:
             self._end()
             why = too_much or "the parser of this format ended its process"
@@ -77,7 +77,7 @@ class Worker:
             return False
         return True
 
-    def _ask(self, path: str | None, seconds: float, most: int) -> tuple[Contents | str | None, str]:
+    def _ask(self, request: dict | None, seconds: float, most: int) -> tuple[Contents | str | None, str]:
         """What the process answers, None where it is no more; and why it had to be ended, if it had."""
         running = self.process
         assert running is not None and running.stdin is not None and running.stdout is not None
@@ -103,8 +103,8 @@ class Worker:
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
         try:
-            if path is not None:
-                running.stdin.write(json.dumps(path).encode() + b"\n")
+            if request is not None:
+                running.stdin.write(json.dumps(request).encode() + b"\n")
                 running.stdin.flush()
             return _receive(running.stdout), ""
         except (OSError, EOFError, ValueError):
@@ -125,16 +125,17 @@ class Worker:
 
 
 def serve() -> None:
-    """What the process does: reads paths from its input, a line each, and writes contents until the input ends."""
+    """What the process does: reads requests from its input, a line each, and writes contents until the input ends."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what parsers print must not get among the answers
     _limit_memory()
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     _send(answers, "")
     for line in sys.stdin.buffer:
-        path = Path(json.loads(line))
+        request = json.loads(line)
+        path = Path(request["path"])
         try:
-            answer: Contents | str = parse(path)
+            answer: Contents | str = parse(path, request["frames"])
         except SceneError as error:
             answer = str(error)
         except BaseException as error:
@@ -192,6 +193,11 @@ def _send(file: BinaryIO, answer: Contents | str) -> None:
             name: np.asarray(array, dtype=np.int64) for name, array in zip(("corners", "counts"), answer.polygons, strict=True)
         }
         arrays |= {f"cells {k}": np.asarray(rows, dtype=np.int64) for k, (_, rows) in enumerate(answer.cells)}
+        if answer.frames is not None:
+            arrays |= {
+                "frames": np.asarray(answer.frames, dtype=np.float64),
+                "times": np.asarray(answer.times, dtype=np.float64),
+            }
         told = {"kinds": [kind for kind, _ in answer.cells], "notes": answer.notes, "repeats": answer.repeats}
     else:
         told = {"failed": answer}
@@ -216,4 +222,5 @@ def _receive(file: BinaryIO) -> Contents | str:
         return told["failed"]
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         cells = [(kind, arrays[f"cells {k}"]) for k, kind in enumerate(told["kinds"])]
-        return Contents(arrays["points"], cells, (arrays["corners"], arrays["counts"]), told["notes"], told["repeats"])
+        polygons, moving = (arrays["corners"], arrays["counts"]), (arrays.get("frames"), arrays.get("times"))
+        return Contents(arrays["points"], cells, polygons, told["notes"], told["repeats"], *moving)

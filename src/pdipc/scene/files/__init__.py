@@ -17,9 +17,13 @@ READERS = {
 }  # fmt: skip
 
 
-def parse(path: Path) -> Contents:
-    """The contents of a file of a known format. Raises whatever its reader does; SceneError where its message is whole."""
-    return reader(path)(path)
+def parse(path: Path, frames: bool = False) -> Contents:
+    """The contents of a file of a known format. Raises whatever its reader does; SceneError where its message is whole.
+
+    frames: whether all frames of a USD file are wanted, which takes time.
+    """
+    own = reader(path)
+    return foreign.usd(path, frames) if own is foreign.usd else own(path)
 
 
 def reader(path: Path):

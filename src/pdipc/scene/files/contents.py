@@ -13,7 +13,7 @@ ORDER_AS_HEXAHEDRON = {"pixel": ("quad", [0, 1, 3, 2]), "voxel": ("hexahedron", 
 class Contents:
     """What a mesh file holds.
 
-    points: (n, 3). cells: kind, as in `CORNERS`, and vertices (c, k). polygons: corners one after another, and corners of each.
+    points: (n, 3); where it holds frames, those of the first. frames: (f, n, 3), and times: (f,) s, where it says them. cells: kind, as in `CORNERS`, and vertices (c, k). polygons: corners one after another, and corners of each.
     notes: what was left out or converted, a sentence each. repeats: whether the format writes shared vertices several times.
     """
 
@@ -22,6 +22,8 @@ class Contents:
     polygons: tuple[np.ndarray, np.ndarray] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     notes: list[str] = field(default_factory=list)
     repeats: bool = False
+    frames: np.ndarray | None = None
+    times: np.ndarray | None = None
 
 
 class Damaged(ValueError):

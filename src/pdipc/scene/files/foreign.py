@@ -3,6 +3,7 @@
 import contextlib
 import io
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -71,93 +72,121 @@ def glb(path: Path) -> Contents:
     return Contents(np.concatenate(points), [("triangle", np.concatenate(triangles))], notes=notes, repeats=True)
 
 
-def usd(path: Path) -> Contents:
+def usd(path: Path, frames: bool = False) -> Contents:
+    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times."""
     try:
         from pxr import Usd, UsdGeom
     except ImportError as error:
         raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
     stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
-    time = Usd.TimeCode.EarliestTime()
-    placed = UsdGeom.XformCache(time)
-    points, cells, corners, counts, notes = [], [], [], [], []
-    others: dict[str, int] = {}
-    hidden, moving, size = 0, 0, 0
+    first = Usd.TimeCode.EarliestTime()
+    prims, found, others, hidden = [], Contents(np.zeros((0, 3))), {}, 0
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         kind = str(prim.GetTypeName())
-        if not prim.IsA(UsdGeom.Gprim) and kind != "PointInstancer":
+        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
             continue
-        if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
             hidden += 1
-            continue
-        if kind not in ("Mesh", "TetMesh"):
-            others[kind] = others.get(kind, 0) + 1
-            continue
-        values = prim.GetAttribute("points").Get(time)
-        if not values:
-            raise Damaged(f'{kind} "{prim.GetPath()}" has no points')
-        matrix = np.array(placed.GetLocalToWorldTransform(prim))  # for rows: p' = p M
-        own = np.array(values, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
-        mirrored = (np.linalg.det(matrix[:3, :3]) < 0) != (
-            prim.GetAttribute("orientation").Get(time) == UsdGeom.Tokens.leftHanded
-        )
-        moving += _usd_moves(prim)
-        tets = prim.GetAttribute("tetVertexIndices" if kind == "TetMesh" else "tetraIndices")
-        if tets and tets.HasValue():
-            # a mirror turns tets inside out; `from_contents` turns back those of a whole block
-            cells.append(("tetra", np.array(tets.Get(time)).reshape(-1, 4) + size))
+        elif kind in ("Mesh", "TetMesh"):
+            prims.append(prim)
         else:
-            sides = np.array(prim.GetAttribute("faceVertexCounts").Get(time), dtype=np.int64).ravel()
-            rows = np.array(prim.GetAttribute("faceVertexIndices").Get(time), dtype=np.int64).ravel()
-            if (len(sides) and sides.min() < 0) or sides.sum() != len(rows):
-                raise Damaged(f'Mesh "{prim.GetPath()}" has {len(rows)} corners, and its faces say {sides.sum()}')
-            if len(rows) and (rows.min() < 0 or rows.max() >= len(own)):
-                raise Damaged(f'Mesh "{prim.GetPath()}" names vertex {rows.max()}; indices must be 0 to {len(own) - 1}')
-            holes = prim.GetAttribute("holeIndices").Get(time)
-            kept = np.ones(len(sides), dtype=bool)
-            kept[[hole for hole in holes or [] if 0 <= hole < len(sides)]] = False
-            if mirrored:
-                ends = np.cumsum(sides)
-                rows = rows[
-                    np.concatenate([np.arange(e - 1, e - n - 1, -1) for e, n in zip(ends, sides, strict=True)] or [[]]).astype(
-                        int
-                    )
-                ]
-            corners.append(rows[np.repeat(kept, sides)] + size)
-            counts.append(sides[kept])
-        points.append(own)
-        size += len(own)
-    if not points:
+            others[kind] = others.get(kind, 0) + 1
+    if not prims:
         raise SceneError(f'mesh file "{path}": holds no Mesh')
-    whole = np.concatenate(points)
-    if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        unit = UsdGeom.GetStageMetersPerUnit(stage)
-        whole = whole * unit
-        if unit != 1.0:
-            notes.append(f"its unit of {unit:g} m was converted to m")
-    else:
-        notes.append("it does not say metersPerUnit: its numbers were taken as m")
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-        whole = whole[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-        notes.append("its z axis, which points up, was turned to y")
+    convert, said = _units(stage)
+    found.points = convert(_usd_points(prims, first))
+    corners, counts, size = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
+    for prim in prims:
+        own = len(prim.GetAttribute("points").Get(first))
+        tets = prim.GetAttribute("tetVertexIndices" if prim.IsA("TetMesh") else "tetraIndices")
+        if tets and tets.HasValue():
+            # a mirror turns tets inside out; those of a whole block are turned back
+            found.cells.append(("tetra", np.array(tets.Get(first)).reshape(-1, 4) + size))
+        else:
+            rows, sides = _usd_faces(prim, own, first)
+            corners.append(rows + size)
+            counts.append(sides)
+        size += own
+    found.polygons = np.concatenate(corners), np.concatenate(counts)
+    times = sorted({time for prim in prims for time in _usd_times(prim)})
+    if frames and len(times) > 1:
+        found.frames = np.stack([convert(_usd_points(prims, Usd.TimeCode(time))) for time in times])
+        found.times = np.array(times) / stage.GetTimeCodesPerSecond()
+    found.notes += said
     if others:
         listed = ", ".join(f"{number} {kind}" for kind, number in sorted(others.items()))
-        notes.append(f"what is no Mesh was left out: {listed}")
+        found.notes.append(f"what is no Mesh was left out: {listed}")
     if hidden:
-        notes.append(f"{hidden} invisible prims were left out")
-    if moving:
-        notes.append(f"{moving} of its meshes move or deform: they were read as they are at the first time")
-    if corners:
-        return Contents(whole, cells, (np.concatenate(corners), np.concatenate(counts)), notes)
-    return Contents(whole, cells, notes=notes)
+        found.notes.append(f"{hidden} invisible prims were left out")
+    if len(times) > 1 and not frames:
+        found.notes.append(_first_of(len(times)))
+    return found
 
 
-def _usd_moves(prim) -> bool:
+def _usd_points(prims: list, time) -> np.ndarray:
+    """(n, 3) points of all prims at a time, in the stage's coordinates."""
     from pxr import UsdGeom
 
+    placed, points = UsdGeom.XformCache(time), []
+    for prim in prims:
+        values = prim.GetAttribute("points").Get(time)
+        if not values:
+            raise Damaged(f'{prim.GetTypeName()} "{prim.GetPath()}" has no points')
+        matrix = np.array(placed.GetLocalToWorldTransform(prim))  # for rows: p' = p M
+        points.append(np.array(values, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3])
+    return np.concatenate(points)
+
+
+def _usd_faces(prim, size: int, time) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the faces of a Mesh, one after another, and corners of each; without holes, and facing outward in the stage."""
+    from pxr import UsdGeom
+
+    sides = np.array(prim.GetAttribute("faceVertexCounts").Get(time), dtype=np.int64).ravel()
+    rows = np.array(prim.GetAttribute("faceVertexIndices").Get(time), dtype=np.int64).ravel()
+    if (len(sides) and sides.min() < 0) or sides.sum() != len(rows):
+        raise Damaged(f'Mesh "{prim.GetPath()}" has {len(rows)} corners, and its faces say {sides.sum()}')
+    if len(rows) and (rows.min() < 0 or rows.max() >= size):
+        raise Damaged(f'Mesh "{prim.GetPath()}" names a vertex that is not there; indices must be 0 to {size - 1}')
+    matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+    left = prim.GetAttribute("orientation").Get(time) == UsdGeom.Tokens.leftHanded
+    if (np.linalg.det(matrix[:3, :3]) < 0) != left:
+        ends = np.cumsum(sides)  # every face backwards
+        within = np.arange(len(rows)) - np.repeat(ends - sides, sides)
+        rows = rows[np.repeat(ends, sides) - 1 - within]
+    kept = np.ones(len(sides), dtype=bool)
+    kept[[hole for hole in prim.GetAttribute("holeIndices").Get(time) or [] if 0 <= hole < len(sides)]] = False
+    return rows[np.repeat(kept, sides)], sides[kept]
+
+
+def _usd_times(prim) -> list[float]:
+    """The time codes at which a prim's points or its place are given."""
+    from pxr import UsdGeom
+
+    times = list(prim.GetAttribute("points").GetTimeSamples())
     while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
-            return True
-        if prim.IsA(UsdGeom.PointBased) and prim.GetAttribute("points").ValueMightBeTimeVarying():
-            return True
+        if prim.IsA(UsdGeom.Xformable):
+            times += UsdGeom.Xformable(prim).GetTimeSamples()
         prim = prim.GetParent()
-    return False
+    return times
+
+
+def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
+    """What turns a stage's points into metres with y up, and the notes that say so."""
+    from pxr import UsdGeom
+
+    unit, notes = 1.0, ["it does not say metersPerUnit: its numbers were taken as m"]
+    if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        unit = UsdGeom.GetStageMetersPerUnit(stage)
+        notes = [f"its unit of {unit:g} m was converted to m"] if unit != 1.0 else []
+    upright = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    if not upright:
+        notes.append("its z axis, which points up, was turned to y")
+
+    def convert(points: np.ndarray) -> np.ndarray:
+        return points * unit if upright else points[:, [0, 2, 1]] * [unit, unit, -unit]
+
+    return convert, notes
+
+
+def _first_of(count: int) -> str:
+    return f"it moves or deforms at {count} times: it was read as it is at the first"

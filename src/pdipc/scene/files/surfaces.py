@@ -20,7 +20,10 @@ def npz(path: Path) -> Contents:
         if "V" not in data:
             raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets) or F (triangles)')
         cells = [(kind, data[name]) for kind, name in (("tetra", "T"), ("triangle", "F")) if name in data]
-        return Contents(data["V"], cells)
+        vertices = data["V"]
+        if vertices.ndim != 3 or not len(vertices):
+            return Contents(vertices, cells)
+        return Contents(vertices[0], cells, frames=vertices, times=data.get("times"))
 
 
 def obj(path: Path) -> Contents:
