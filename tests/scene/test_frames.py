@@ -112,7 +112,7 @@ def test_time_samples_of_usd(tmp_path):
         points.Set([tuple(map(float, 100 * point)) for point in frame], code)
     stage.Save()
     given = scene(str(tmp_path / "a.usda"), mesh=str(tmp_path / "a.usda"))
-    assert whereabouts(given, 0.2) == pytest.approx(wave(SHEET.vertices, 0.2) + [0.2 * 10 / 15, 0, 0], abs=1e-6)
+    assert whereabouts(given, 0.2) == pytest.approx(wave(SHEET.vertices, 0.2) + np.array([0.2 * 10 / 15, 0, 0]), abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_time_samples_of_usd(tmp_path):
         ({"V": FRAMES}, "says no times; give the frames a second as frame_rate"),
         ({"V": FRAMES, "times": TIMES[:2]}, "holds 3 frames and times of the shape (2,)"),
         ({"V": FRAMES, "times": TIMES[::-1]}, "times must be numbers in ascending order"),
-        ({"V": FRAMES + [0, np.inf, 0], "times": TIMES}, "frame 0, vertex 0 = [-0.5, inf, -0.5] is not finite"),
+        ({"V": FRAMES + np.array([0, np.inf, 0]), "times": TIMES}, "frame 0, vertex 0 = [-0.5, inf, -0.5] is not finite"),
         ({"V": FRAMES[:, :-1], "times": TIMES}, "the cache has frames of 48 vertices; its mesh has 49"),
         ({"V": FRAMES[0]}, "holds one frame only; needed: several"),
         ({"W": FRAMES}, "needed: V and T (tets) or F (triangles)"),
@@ -200,7 +200,12 @@ def test_a_run_with_a_cache_resumes_to_the_same_bits(tmp_path):
 def test_a_cloth_caught_between_parts_that_close_is_held_and_what_closes_lags():
     """Two plates of one obstacle close on a cloth until they would overlap: no vertex is shot away, nothing meets."""
     n = len(SHEET.vertices)
-    closing = np.stack([np.concatenate([SHEET.vertices - [0, gap, 0], SHEET.vertices + [0, gap, 0]]) for gap in (0.02, -0.005)])
+    closing = np.stack(
+        [
+            np.concatenate([SHEET.vertices - np.array([0, gap, 0]), SHEET.vertices + np.array([0, gap, 0])])
+            for gap in (0.02, -0.005)
+        ]
+    )
     mesh = {"vertices": closing[0], "triangles": np.concatenate([SHEET.triangles, SHEET.triangles[:, ::-1] + n])}
     cloth = {
         "name": "c",
