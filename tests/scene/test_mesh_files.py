@@ -354,7 +354,7 @@ def test_usd_that_moves_or_has_no_unit_is_said(tmp_path):
     assert mesh.vertices[:, 2] == pytest.approx(1.0)
     assert mesh.notes == [
         "it does not say metersPerUnit: its numbers were taken as m",
-        "1 of its meshes move or deform: they were read as they are at the first time",
+        "it moves or deforms at 2 times: it was read as it is at the first",
     ]
 
 

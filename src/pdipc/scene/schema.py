@@ -191,6 +191,9 @@ Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST, _rows_schema("in
 Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST, _rows_schema("integer", 4)]
 
 
+_FRAMES_SCHEMA = WithJsonSchema({"type": "array", "items": _rows_schema("number", 3).json_schema})
+
+
 def _frames(value: Any) -> np.ndarray:
     """(f, n, 3) numbers, in Python an array, in files lists."""
     if not isinstance(value, np.ndarray):
@@ -499,7 +502,9 @@ def _motion_kind(value: Any) -> str:
 class FrameArrays(Table):
     """Positions of all vertices of an obstacle over time, given by their numbers."""
 
-    vertices: Annotated[np.ndarray, BeforeValidator(_frames), _AS_LIST] = Field(description="V (f, n, 3): of each frame, m.")
+    vertices: Annotated[np.ndarray, BeforeValidator(_frames), _AS_LIST, _FRAMES_SCHEMA] = Field(
+        description="V (f, n, 3): of each frame, m."
+    )
     times: list[Number] = Field(description="When each frame is there, s, ascending; counted from the first.")
 
     def __eq__(self, other: object) -> bool:
