@@ -1,4 +1,19 @@
-"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full."""
+"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full.
+
+**Lemma 1 (moving boxes).** Let thing A stay within (1 - s) a(0) + s a(1) at every fraction s of the way, a box at the begin and one at
+the end, and B within b(s) likewise. If the least of a is above the greatest of b along one axis at s = 0 and at s = 1, it is in between,
+since both are linear in s; so A and B never share a point. A box around several holds each at both ends, so it holds each all the way:
+what is apart from a node of a tree is apart from all below it, and from all of a patch.
+
+**Lemma 2 (rounding).** Boxes are float32, as Warp's trees are. They are made from v = x -+ reach, in double precision, clamped to
++-FARTHEST and rounded to f, which is off by at most u |f|, u = 2^-24, and 2^-150. Then 4u |f| and TINY are taken off, or added, each
+with another rounding of u |f| at most, or of u TINY. So the float32 corner is outside of the clamped v by u |f|, which covers the
+rounding of v too. Clamping is monotone: numbers that are strictly apart after it are so before. It keeps all sums and areas that a tree
+makes finite; whatever is farther out than FARTHEST meets all that is, and the sieve decides. No box of something that is
+there is empty, and an empty one, from +inf to -inf, is apart from all. So boxes hold for all finite coordinates.
+
+Everything else here, in `patches` and in Warp's trees compares float32 numbers, or takes the least or greatest of them: nothing rounds.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -12,6 +27,9 @@ from pdipc.device.precision import Real
 SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
+FARTHEST = 1.0e18  # m
+OUTWARD = 2.0**-22  # of a corner's coordinate
+TINY = 1.0e-30  # m
 
 
 @wp.struct
@@ -68,7 +86,7 @@ def join(a: Box, b: Box) -> Box:
 
 @wp.func
 def meet(a: Box, b: Box) -> bool:
-    """Whether they overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other."""
+    """Whether they may overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other (Lemma 1)."""
     for axis in range(3):
         if a.begin_low[axis] > b.begin_high[axis] and a.end_low[axis] > b.end_high[axis]:
             return False
@@ -80,7 +98,7 @@ def meet(a: Box, b: Box) -> bool:
 def boxes(count: int, device: Device) -> Boxes:
     """Room for `count` boxes; each is empty, and meets nothing."""
     made = Boxes()
-    for name, value in (("begin_low", 3e38), ("begin_high", -3e38), ("end_low", 3e38), ("end_high", -3e38)):
+    for name, value in (("begin_low", np.inf), ("begin_high", -np.inf), ("end_low", np.inf), ("end_high", -np.inf)):
         setattr(made, name, wp.full(max(1, count), wp.vec3(value, value, value), dtype=wp.vec3, device=device.warp))
     return made
 
@@ -89,18 +107,19 @@ def boxes(count: int, device: Device) -> Boxes:
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
-    # Boxes are float32, as Warp's trees are. One rounding errs by less than 6e-8 of the coordinate; this is outward of that.
-    outward = wp.constant(1.2e-7)
+    wide = wp.float64
+    farthest, outward, tiny = wp.constant(wide(FARTHEST)), wp.constant(OUTWARD), wp.constant(TINY)
 
     @wp.func
-    def below(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f - outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) - wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
+    def below(x: scalar, reach: scalar) -> wp.float32:
+        """At most x - reach (Lemma 2)."""
+        f = wp.float32(wp.clamp(wide(x) - wide(reach), -farthest, farthest))
+        return f - outward * wp.abs(f) - tiny
 
     @wp.func
-    def above(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f + outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) + wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
+    def above(x: scalar, reach: scalar) -> wp.float32:
+        f = wp.float32(wp.clamp(wide(x) + wide(reach), -farthest, farthest))
+        return f + outward * wp.abs(f) + tiny
 
     @wp.kernel(module=module)
     def vertex_boxes(
@@ -111,11 +130,11 @@ def kernels(real: Real) -> SimpleNamespace:
         boxes_out: Boxes,
     ):
         i = first + wp.tid()
-        r = vec3(reach[i], reach[i], reach[i])
-        boxes_out.begin_low[i] = below(x0[i] - r)
-        boxes_out.begin_high[i] = above(x0[i] + r)
-        boxes_out.end_low[i] = below(x1[i] - r)
-        boxes_out.end_high[i] = above(x1[i] + r)
+        r, a, b = reach[i], x0[i], x1[i]
+        boxes_out.begin_low[i] = wp.vec3(below(a[0], r), below(a[1], r), below(a[2], r))
+        boxes_out.begin_high[i] = wp.vec3(above(a[0], r), above(a[1], r), above(a[2], r))
+        boxes_out.end_low[i] = wp.vec3(below(b[0], r), below(b[1], r), below(b[2], r))
+        boxes_out.end_high[i] = wp.vec3(above(b[0], r), above(b[1], r), above(b[2], r))
 
     @wp.kernel(module=module)
     def settle(
