@@ -5,14 +5,12 @@ the end, and B within b(s) likewise. If the least of a is above the greatest of 
 since both are linear in s; so A and B never share a point. A box around several holds each at both ends, so it holds each all the way:
 what is apart from a node of a tree is apart from all below it, and from all of a patch.
 
-**Lemma 2 (rounding).** Boxes are float32, as Warp's trees are. They are made from v = x -+ reach, in double precision, clamped to
-+-FARTHEST and rounded to f, which is off by at most u |f|, u = 2^-24, and 2^-150. Then 4u |f| and TINY are taken off, or added, each
-with another rounding of u |f| at most, or of u TINY. So the float32 corner is outside of the clamped v by u |f|, which covers the
-rounding of v too. Clamping is monotone: numbers that are strictly apart after it are so before. It keeps all sums and areas that a tree
-makes finite; whatever is farther out than FARTHEST meets all that is, and the sieve decides. No box of something that is
-there is empty, and an empty one, from +inf to -inf, is apart from all. So boxes hold for all finite coordinates.
-
-Everything else here, in `patches` and in Warp's trees compares float32 numbers, or takes the least or greatest of them: nothing rounds.
+**Lemma 2 (rounding).** A corner is x - reach or x + reach, rounded to double precision, clamped to +-FARTHEST, and rounded to float32, as
+Warp's trees are. Each of these maps is monotone, and the same for all corners. So a corner that is above another one after them, not
+equal to it, is above it in real arithmetic: no rounding makes a gap where there is none, and nothing has to be rounded outward. Minima,
+maxima and comparisons of corners, which is all that happens to them here, in `patches` and in Warp's trees, do not round. The clamp keeps
+the sums and areas that a tree makes finite; what is farther out meets all that is, and the sieve decides. A box of something that is
+there is never empty, and an empty one, from +inf to -inf, is apart from all. So boxes hold for all finite coordinates.
 """
 
 import functools
@@ -28,13 +26,11 @@ SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
 FARTHEST = 1.0e18  # m
-OUTWARD = 2.0**-22  # of a corner's coordinate
-TINY = 1.0e-30  # m
 
 
 @wp.struct
 class Boxes:
-    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32, rounded outward.
+    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32.
 
     At a fraction s of the way a thing is inside the box (1 - s) begin + s end.
     """
@@ -108,18 +104,17 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
     wide = wp.float64
-    farthest, outward, tiny = wp.constant(wide(FARTHEST)), wp.constant(OUTWARD), wp.constant(TINY)
+    farthest = wp.constant(wide(FARTHEST))
 
     @wp.func
-    def below(x: scalar, reach: scalar) -> wp.float32:
-        """At most x - reach (Lemma 2)."""
-        f = wp.float32(wp.clamp(wide(x) - wide(reach), -farthest, farthest))
-        return f - outward * wp.abs(f) - tiny
-
-    @wp.func
-    def above(x: scalar, reach: scalar) -> wp.float32:
-        f = wp.float32(wp.clamp(wide(x) + wide(reach), -farthest, farthest))
-        return f + outward * wp.abs(f) + tiny
+    def corner(x: vec3, reach: wide) -> wp.vec3:
+        """x + reach, by the maps of Lemma 2."""
+        v = wp.vec3d(wide(x[0]) + reach, wide(x[1]) + reach, wide(x[2]) + reach)
+        return wp.vec3(
+            wp.float32(wp.clamp(v[0], -farthest, farthest)),
+            wp.float32(wp.clamp(v[1], -farthest, farthest)),
+            wp.float32(wp.clamp(v[2], -farthest, farthest)),
+        )
 
     @wp.kernel(module=module)
     def vertex_boxes(
@@ -130,11 +125,11 @@ def kernels(real: Real) -> SimpleNamespace:
         boxes_out: Boxes,
     ):
         i = first + wp.tid()
-        r, a, b = reach[i], x0[i], x1[i]
-        boxes_out.begin_low[i] = wp.vec3(below(a[0], r), below(a[1], r), below(a[2], r))
-        boxes_out.begin_high[i] = wp.vec3(above(a[0], r), above(a[1], r), above(a[2], r))
-        boxes_out.end_low[i] = wp.vec3(below(b[0], r), below(b[1], r), below(b[2], r))
-        boxes_out.end_high[i] = wp.vec3(above(b[0], r), above(b[1], r), above(b[2], r))
+        r = wide(reach[i])
+        boxes_out.begin_low[i] = corner(x0[i], -r)
+        boxes_out.begin_high[i] = corner(x0[i], r)
+        boxes_out.end_low[i] = corner(x1[i], -r)
+        boxes_out.end_high[i] = corner(x1[i], r)
 
     @wp.kernel(module=module)
     def settle(
