@@ -106,7 +106,7 @@ def ask_judge(rng, counts, report) -> None:
     for family in FAMILIES:
         for precision in rejections.PRECISIONS:
             x, _, triangles, _ = rejections.soup(family, precision, rng, MOTIONS)
-            if len(x) == 0 or np.abs(x).max() > 1e30:  # the witness's range
+            if len(x) == 0:
                 continue
             edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
             ends, corners = x[edges], x[triangles]
