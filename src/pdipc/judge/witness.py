@@ -109,7 +109,9 @@ def _folded(positions, triangles, edges, owner, first) -> np.ndarray:
             arms = [positions[tip] - o for tip in tips]
             normals = [np.cross(d, arm) for arm in arms]
             bounds = [_cross_of_magnitudes(d, arm) for arm in arms]
-            doubt = 16 * 2.0**-53 * np.einsum("ij,ij->i", *bounds) + UNDERFLOW * (1.0 + sum(each.sum(axis=1) for each in bounds))
+            doubt = 16 * 2.0**-53 * np.einsum("ij,ij->i", *bounds) + UNDERFLOW * (
+                1.0 + sum(each.sum(axis=1) for each in bounds)
+            )
             same_side = np.einsum("ij,ij->i", *normals) > -doubt
             flat = _sign(arms[1], normals[0], bounds[0]) == 0
             for row in np.flatnonzero(same_side & flat):
