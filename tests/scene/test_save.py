@@ -1,15 +1,18 @@
 """Scenes that are saved load to the same scene."""
 
 import tomllib
+import typing
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 import pdipc
-from pdipc.scene import save
+from pdipc.scene import save, schema
 from pdipc.scene.assembly import assemble
+from pdipc.scene.check import check
 from pdipc.scene.load import bundled_scenes, load_scene
 from tests.physics.scenes import cloth, floor, solid
 
@@ -65,6 +68,38 @@ def test_mesh_files_are_found_from_where_it_is_saved(tmp_path, monkeypatch, else
 def test_only_toml_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.toml"):
         pdipc.Scene(bodies=[cloth("sheet", [1.0, 1.0], [3, 3])]).save(tmp_path / "scene.json")
+
+
+def test_every_key_that_names_a_file_is_known():
+    """Those that loading takes as relative to the scene's file."""
+    found = set()
+
+    def look(annotation, key):
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            for name, field in annotation.model_fields.items():
+                look(field.annotation, name)
+                look(typing.Annotated[(str, *field.metadata)] if field.metadata else str, name)
+        for part in typing.get_args(annotation):
+            if getattr(part, "func", None) is schema._resolve:
+                found.add(key)
+            elif not isinstance(part, str):
+                look(part, key)
+
+    look(pdipc.Scene, "")
+    assert found == set(save.FILES)
+
+
+def test_caches_are_found_from_where_it_is_saved(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
+    np.savez("still.npz", V=np.stack([corners, corners + np.array([0, 0.1, 0])]), times=[0.0, 1.0])
+    mesh = {"vertices": corners, "triangles": [[0, 1, 2]]}
+    obstacle = {"name": "o", "mesh": mesh, "motion": {"cache": "still.npz"}}
+    scene = pdipc.Scene(bodies=[cloth("sheet", [1.0, 1.0], [3, 3], at=(0, 1, 0))], obstacles=[obstacle])
+    (tmp_path / "saved").mkdir()
+    scene.save(tmp_path / "saved/scene.toml")
+    monkeypatch.chdir("/")
+    assert not check(load_scene(tmp_path / "saved/scene.toml"))
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**63), 2**63 - 1)

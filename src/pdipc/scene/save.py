@@ -8,11 +8,12 @@ import numpy as np
 from pydantic import BaseModel
 
 TAGS = ("kind", "shape")  # which of several tables it is: a file must say so
+FILES = ("mesh", "cache")  # where text is the name of a file
 WIDTH = 110  # characters of a line, if a list can be broken before
 
 
 def to_toml(scene: BaseModel, folder: Path) -> str:
-    """TOML that loads to the same scene from a file in `folder`: meshes below it are named from there, others in full."""
+    """TOML that loads to the same scene from a file in `folder`: files below it are named from there, others in full."""
     tables = _plain(scene, folder)
     lines = [f"{name} = {_value(value)}" for name, value in tables.items() if not _is_section(value)]
     for name, value in tables.items():
@@ -38,7 +39,7 @@ def _plain(value: Any, folder: Path, key: str = "") -> Any:
         return value.tolist()
     if isinstance(value, list | tuple):
         return [_plain(entry, folder) for entry in value]
-    if isinstance(value, str) and key == "mesh" and not value.startswith("warp:"):
+    if isinstance(value, str) and key in FILES and not value.startswith("warp:"):
         file = Path(value).resolve()
         return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
     return value
