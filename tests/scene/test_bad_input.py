@@ -131,6 +131,18 @@ def test_what_needs_more_memory_than_there_is_says_how_much(body, message):
     assert " GiB are free; take fewer c" in str(finding)
 
 
+def test_files_larger_than_the_memory_are_not_read(tmp_path, monkeypatch):
+    for name in ("a.obj", "a.toml"):
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(10_000)
+    monkeypatch.setattr(meshes, "free_memory", lambda: 15_000)
+    monkeypatch.setattr(load, "free_memory", lambda: 15_000)
+    with pytest.raises(SceneError, match=r"a.obj.: needs at least .* GiB of memory, and .* are free"):
+        meshes.read(tmp_path / "a.obj")
+    with pytest.raises(SceneError, match=r"a.toml.: needs about .* GiB of memory, and .* are free"):
+        load.load_scene(tmp_path / "a.toml")
+
+
 def test_the_memory_that_shapes_and_copies_need_is_about_what_is_said(monkeypatch):
     """Half of it would not be enough, by Python's own count."""
     import tracemalloc

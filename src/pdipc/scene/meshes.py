@@ -15,11 +15,13 @@ from pdipc.scene import files
 from pdipc.scene.cells import CELL_FACES, tetrahedra, triangulate
 from pdipc.scene.errors import SceneError
 from pdipc.scene.files.contents import CORNERS, Contents, lines_left_out
+from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
 TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
 SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", ".usd", ".usda", ".usdc")
+BYTES_PER_BYTE = 2  # of memory for a mesh file, at least: the file itself and its numbers
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # outward for a tet of positive volume
 
@@ -146,6 +148,9 @@ def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> 
         raise SceneError(f'mesh file "{_short(path)}": there is no such file')
 
     def read() -> Contents:
+        needed, free = BYTES_PER_BYTE * path.stat().st_size, free_memory()
+        if needed > free:
+            raise SceneError(f'mesh file "{path}": needs at least {gib(needed)} of memory, and {gib(free)} are free')
         if not files.is_foreign(path):
             return files.parse(path, frames)
         with contextlib.nullcontext(worker) if worker else Worker() as reader:

@@ -4,6 +4,7 @@ Units are SI (m, kg, s, N, Pa); orientations are in degrees, rates of rotation i
 """
 
 import itertools
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -239,7 +240,8 @@ def _resolve(path: str, info: ValidationInfo) -> str:
     if folder is None or path.startswith("warp:"):
         return path
     try:
-        return str((Path(folder) / path).resolve())
+        whole = Path(folder) / path
+        return os.path.abspath(whole) if "*" in path else str(whole.resolve())  # no file has the name of a pattern
     except (OSError, RuntimeError, ValueError) as error:  # links in circles, names that are too long
         raise ValueError(f"is no path to a file: {error}") from None
 
