@@ -233,7 +233,9 @@ def test_obj_indices_count_back_from_where_they_stand(tmp_path):
 
 
 def test_sewing_lines_of_an_obj_are_said(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 1 0\nv 1 1 0\nv 1 1 1\nf 1 2 3\nf 4 5 6\nl 1 4\nl 2 5 6\n")
+    (tmp_path / "a.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 1 0 1 # x\nv 0 1 0\nv 1 1 0\nv 1 1 1\nf 1 2 3\nf 4 5 6\nl 1 4\nl 2 5 6\n"
+    )
     (note,) = meshes.read(tmp_path / "a.obj").notes
     assert note.startswith("3 lines were left out") and "attachments" in note
 
@@ -261,8 +263,8 @@ def test_ply_with_faces_of_several_sizes(tmp_path, order):
 
 def test_off_with_polygons_and_colours(tmp_path):
     (tmp_path / "a.off").write_text(
-        "OFF # a comment\n6 3 0\n"
-        + "\n".join(" ".join(map(str, p)) for p in QUAD_AND_TRIANGLES)
+        "COFF # a comment\n6 3 0\n"
+        + "\n".join(" ".join(map(str, [*p, 255, 0, 0])) for p in QUAD_AND_TRIANGLES)
         + "\n\n4 0 3 4 1 255 0 0\n3 1 4 5\n3 1 5 2 0.1 0.2 0.3\n"
     )
     assert area(meshes.read(tmp_path / "a.off")) == pytest.approx(2.0)
@@ -308,6 +310,8 @@ def test_all_meshes_of_usd_where_they_stand_in_metres_y_up(tmp_path):
     square(made, geometry, "/root/b", at=(100, 0, 0), side=50.0)
     square(made, geometry, "/root/hidden", side=50.0).MakeInvisible()
     geometry.Sphere.Define(made, "/root/ball")
+    geometry.Mesh.Define(made, "/root/empty")
+    square(made, geometry, "/root/standin", side=50.0).CreatePurposeAttr(geometry.Tokens.proxy)
     geometry.Mesh.Define(made, "/root/off").GetPrim().SetActive(False)
     made.Save()
     mesh = meshes.read(tmp_path / "a.usda")
@@ -318,7 +322,7 @@ def test_all_meshes_of_usd_where_they_stand_in_metres_y_up(tmp_path):
     assert mesh.notes == [
         "its unit of 0.01 m was converted to m",
         "its z axis, which points up, was turned to y",
-        "what is no Mesh was left out: 1 Sphere",
+        "prims were left out: 1 Mesh of purpose proxy, 1 Mesh without points, 1 Sphere",
         "1 invisible prims were left out",
     ]
 

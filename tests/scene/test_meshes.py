@@ -56,7 +56,7 @@ def test_triangles_from_trimesh_formats(tmp_path, suffix):
 
 def test_npz_with_tets_or_triangles(tmp_path):
     np.savez(tmp_path / "t.npz", V=BALL.vertices, T=BALL.tets[:, [0, 2, 1, 3]])
-    np.savez(tmp_path / "f.npz", V=BALL.vertices, F=BALL.triangles)
+    np.savez(tmp_path / "f.npz", V=BALL.vertices, F=BALL.triangles, T=[])
     np.savez(tmp_path / "x.npz", W=BALL.vertices)
     tets = meshes.read(tmp_path / "t.npz")
     assert meshes.tet_volumes(tets.vertices, tets.tets).min() > 0, "a mesh of negative tets is another convention: turned"

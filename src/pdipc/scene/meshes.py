@@ -196,11 +196,13 @@ def from_contents(contents: Contents, where: str, whole: bool = False) -> Mesh:
     blocks: dict[str, list[np.ndarray]] = {kind: [] for kind in CORNERS}
     higher: dict[str, int] = {}
     for kind, rows in contents.cells:
+        if not rows.size:
+            continue
         corners = CORNERS[kind]
         if rows.ndim != 2 or rows.shape[1] < corners:
             name = {"tetra": "tets", "triangle": "triangles"}.get(kind, kind)
             raise SceneError(f"{where}: {name} have the shape {rows.shape}; they must be (m, {corners})")
-        if rows.shape[1] > corners and len(rows):
+        if rows.shape[1] > corners:
             higher[kind] = higher.get(kind, 0) + len(rows)
         blocks[kind].append(rows[:, :corners])
     if higher:

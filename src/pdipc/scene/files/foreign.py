@@ -85,12 +85,18 @@ def usd(path: Path, frames: bool = False) -> Contents:
         kind = str(prim.GetTypeName())
         if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
             continue
+        purpose = UsdGeom.Imageable(prim).ComputePurpose()
         if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
             hidden += 1
-        elif kind in ("Mesh", "TetMesh"):
+            continue
+        if purpose in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):  # they stand for what is there as well
+            kind = f"{kind} of purpose {purpose}"
+        elif kind in ("Mesh", "TetMesh") and prim.GetAttribute("points").Get(first):
             prims.append(prim)
-        else:
-            others[kind] = others.get(kind, 0) + 1
+            continue
+        elif kind in ("Mesh", "TetMesh"):
+            kind = f"{kind} without points"
+        others[kind] = others.get(kind, 0) + 1
     if not prims:
         raise SceneError(f'mesh file "{path}": holds no Mesh')
     convert, said = _units(stage)
@@ -115,7 +121,7 @@ def usd(path: Path, frames: bool = False) -> Contents:
     found.notes += said
     if others:
         listed = ", ".join(f"{number} {kind}" for kind, number in sorted(others.items()))
-        found.notes.append(f"what is no Mesh was left out: {listed}")
+        found.notes.append(f"prims were left out: {listed}")
     if hidden:
         found.notes.append(f"{hidden} invisible prims were left out")
     if len(times) > 1 and not frames:

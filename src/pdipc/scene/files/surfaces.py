@@ -31,7 +31,7 @@ def obj(path: Path) -> Contents:
     points, corners, counts, lines, others = [], [], [], 0, set()
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
-        key, *values = line.split() or [""]
+        key, *values = line.partition("#")[0].split() or [""]
         if key == "v":
             if len(values) < 3:
                 raise Damaged(f"line {number} has {len(values)} coordinates of a vertex; needed: 3")
@@ -58,31 +58,25 @@ def obj(path: Path) -> Contents:
 
 
 def off(path: Path) -> Contents:
-    """Object File Format, as text."""
-    words = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace")).split()
-    head = re.fullmatch(r"(ST)?(C)?(N)?OFF", words[0]) if words else None
-    if head is None:
-        raise Damaged(f'it begins with "{words[0][:20] if words else ""}"; needed: OFF')
-    if words[1:2] == ["BINARY"]:
+    """Object File Format, as text: a line for each vertex, which may say a normal or a colour, too, and for each face."""
+    text = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace"))
+    rows = [row for row in (line.split() for line in text.splitlines()) if row]
+    if not rows or not re.fullmatch(r"(ST)?C?N?OFF", rows[0][0]):
+        raise Damaged(f'it begins with "{text.strip()[:20]}"; needed: OFF')
+    if "BINARY" in rows[0]:
         raise Damaged("it is binary; only text is read")
-    n, faces = int(words[1]), int(words[2])
-    at, width = 4, 3 + 3 * bool(head[3]) + 4 * bool(head[2]) + 2 * bool(head[1])
-    if not 0 <= n * width <= len(words) - at:
-        raise Damaged(f"its head says {n} vertices, and the file ends before")
-    points = floats(words[at : at + n * width], width)[:, :3]
-    # what follows a face, its colour, has no count: faces are lines
-    lines = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace")).splitlines()
-    rows = [row for row in (line.split() for line in lines) if row]
-    seen, start = 0, 0
-    while seen < at + n * width and start < len(rows):
-        seen += len(rows[start])
-        start += 1
-    rows = rows[start : start + faces]
-    if seen != at + n * width or len(rows) < faces or any(len(row) <= int(row[0]) for row in rows):
-        raise Damaged(f"its head says {faces} faces, and they are not there, a line each")
-    counts = np.array([int(row[0]) for row in rows], dtype=np.int64)
-    corners = np.array([int(index) for row in rows for index in row[1 : 1 + int(row[0])]], dtype=np.int64)
-    return Contents(points, polygons=(corners, counts))
+    head, rows = (rows[0][1:], rows[1:]) if len(rows[0]) > 1 else (rows[1] if len(rows) > 1 else [], rows[2:])
+    n, faces = (int(word) for word in [*head, "0", "0"][:2])
+    if n < 0 or faces < 0 or len(rows) < n + faces:
+        raise Damaged(f"its head says {n} vertices and {faces} faces, and {len(rows)} lines follow")
+    if any(len(row) < 3 for row in rows[:n]):
+        raise Damaged("a vertex has fewer than three coordinates")
+    polygons = [(int(row[0]), row) for row in rows[n : n + faces]]
+    if any(not 0 <= size < len(row) for size, row in polygons):
+        raise Damaged("a face has fewer vertices than it says")
+    corners = [int(index) for size, row in polygons for index in row[1 : 1 + size]]
+    counts = np.array([size for size, _ in polygons], dtype=np.int64)
+    return Contents(floats([row[:3] for row in rows[:n]], 3), polygons=(np.array(corners, dtype=np.int64), counts))
 
 
 def stl(path: Path) -> Contents:
