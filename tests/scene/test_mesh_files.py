@@ -102,6 +102,26 @@ def test_a_collapsed_hexahedron_is_cut_into_what_it_fills():
     assert meshes.tet_volumes(points, cells.tetrahedra("hexahedron", wedge)).sum() == pytest.approx(0.5)
 
 
+def test_polygons_without_measure_end_soon():
+    """A polygon that crosses itself everywhere, one on a line, a large one; and one that is refused for its size."""
+    rng = np.random.default_rng(0)
+    line = np.column_stack([np.linspace(0, 1, 500), np.zeros(500), np.zeros(500)])
+    round_ = np.exp(2j * np.pi * np.arange(1000) / 1000)
+    begun = time.monotonic()
+    for points, crosses in (
+        (rng.random((500, 3)), 1),
+        (line, 0),
+        (np.column_stack([round_.real, round_.imag, 0 * round_.real]), 0),
+    ):
+        triangles, crossed = cells.triangulate(points, np.arange(len(points)), np.array([len(points)]))
+        assert (len(triangles), crossed) == (len(points) - 2, crosses)
+    assert time.monotonic() - begun < 30.0
+    many = cells.MOST_CORNERS + 1
+    contents = meshes.Contents(np.zeros((many, 3)), polygons=(np.arange(many), np.array([many])))
+    with pytest.raises(SceneError, match=f"here: a face has {many} corners; at most {cells.MOST_CORNERS} are cut"):
+        meshes.from_contents(contents, "here")
+
+
 # --- formats ---
 
 

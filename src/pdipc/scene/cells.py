@@ -10,6 +10,7 @@ CELL_FACES = {
     "tetra": [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
 }
 ROUNDING = 1e-12  # of a polygon's extent squared: what lies nearer to an edge lies on it
+MOST_CORNERS = 2000  # of a polygon: the time to cut it grows with their square
 BETTER = 1.0 + 1e-6  # the second diagonal of a quad is taken where its smaller triangle is larger by this factor
 
 
@@ -53,9 +54,11 @@ def triangulate(points: np.ndarray, corners: np.ndarray, counts: np.ndarray) -> 
             cut, bad = _quads(points, rings)
             crossed += bad
         else:
-            parts = [_clip(points[ring]) for ring in rings]
-            cut = np.stack([ring[part] for ring, (part, _) in zip(rings, parts, strict=True)])
-            crossed += sum(bad for _, bad in parts)
+            cut = np.stack([rings[:, [0, k, k + 1]] for k in range(1, size - 1)], axis=1)
+            for number in np.flatnonzero(~_are_fans(points[rings])):
+                part, bad = _clip(points[rings[number]])
+                cut[number] = rings[number][part]
+                crossed += bad
         triangles.append(cut.reshape(-1, 3))
         origin.append(np.repeat(which, size - 2))
     if not triangles:
@@ -79,6 +82,19 @@ def _quads(points: np.ndarray, rings: np.ndarray) -> tuple[np.ndarray, int]:
     turned = (least_other > 0) & (least_other > BETTER * least_one)
     crossed = np.count_nonzero((np.maximum(least_one, least_other) <= 0) & (size_one > 0) & (size_other > 0))
     return np.where(turned[:, None, None], rings[:, other], rings[:, one]), crossed
+
+
+def _are_fans(rings: np.ndarray) -> np.ndarray:
+    """(p,) bool: which polygons (p, n, 3) are cut rightly from their first corner, as all convex ones are."""
+    sides = rings[:, 1:] - rings[:, :1]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        normal = np.cross(sides[:, :-1], sides[:, 1:]).sum(axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        flat = sides - np.einsum("pki,pi->pk", sides, normal)[..., None] * normal[:, None]
+        areas = np.einsum("pki,pi->pk", np.cross(flat[:, :-1], flat[:, 1:]), normal)
+        angles = np.arctan2(areas, np.einsum("pki,pki->pk", flat[:, :-1], flat[:, 1:]))
+        extent = np.abs(sides).max(axis=(1, 2))
+        return np.all(areas > ROUNDING * extent[:, None] ** 2, axis=1) & (angles.sum(axis=1) < 2 * np.pi - 1e-6)
 
 
 def _clip(points: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -114,11 +130,14 @@ def _clip(points: np.ndarray) -> tuple[np.ndarray, bool]:
         if quality[k] <= ROUNDING:
             quality = [shape(k) for k in range(len(ring))]  # what was in the way may be gone
             k = int(np.argmax(quality))
+            if quality[k] <= ROUNDING:  # what is left has no area, or crosses itself
+                break
         triangles.append([ring[k - 1], ring[k], ring[(k + 1) % len(ring)]])
         del ring[k], quality[k]
         for near in (k - 1, k % len(ring)):
             quality[near] = shape(near)
-    return np.array([*triangles, ring]), _crosses(flat)
+    triangles += [[ring[0], ring[k], ring[k + 1]] for k in range(1, len(ring) - 1)]
+    return np.array(triangles), _crosses(flat)
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pdipc.scene import files
-from pdipc.scene.cells import CELL_FACES, tetrahedra, triangulate
+from pdipc.scene.cells import CELL_FACES, MOST_CORNERS, tetrahedra, triangulate
 from pdipc.scene.errors import SceneError
 from pdipc.scene.files.contents import CORNERS, Contents, lines_left_out
 from pdipc.scene.memory import free_memory, gib
@@ -239,6 +239,8 @@ def from_contents(contents: Contents, where: str, whole: bool = False) -> Mesh:
     if small.any():
         notes.append(f"{np.count_nonzero(small)} faces of fewer than three corners were left out")
         corners, counts = corners[np.repeat(~small, counts)], counts[~small]
+    if counts.max(initial=0) > MOST_CORNERS:
+        raise SceneError(f"{where}: a face has {counts.max()} corners; at most {MOST_CORNERS} are cut, so give smaller ones")
     triangles, crossed = triangulate(points, corners, counts)
     if crossed:
         notes.append(f"{crossed} polygons cross themselves, so that no way to cut them is right")
