@@ -24,7 +24,8 @@ UNIT = 1 << 30  # times are kept as integers over this unit, rounded down: the l
 FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
 LATER_BACKOFF = 0.1  # in the passes that check shortened motions
 SHRINK = 0.9
-MAX_PASSES = 30
+STUBBORN = 20  # passes after which vertices that still hit something stay where they are
+MAX_PASSES = 60  # and after which all do
 
 
 @functools.cache
@@ -122,9 +123,11 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         multiplier: wp.array(dtype=wp.int32),
         passes: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vec3),
-        x_tilde: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
         fraction: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
@@ -132,12 +135,17 @@ def kernels(real: Real) -> SimpleNamespace:
             shrink = scalar(1.0)
             if passes[0] > 0:
                 shrink = scalar(SHRINK)
-            fraction[i] = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
-            x_end_out[i] = x[i] + fraction[i] * (x_tilde[i] - x[i])
+            f = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
+            if passes[0] >= STUBBORN:
+                # not settled: these stay where they are, and the next outer iteration starts from a stronger barrier
+                f = scalar(0.0)
+            fraction[i] = f
+            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i])
         if passes[0] >= MAX_PASSES:
-            # Not settled: nobody moves. Always feasible, and the next outer iteration starts from a stronger barrier.
+            # nobody moves, which is always feasible
             fraction[i] = scalar(0.0)
-            x_end_out[i] = x[i]
+            u_end_out[i] = u[i]
+        x_end_out[i] = base[i] + u_end_out[i]
 
     @wp.kernel(module=module)
     def decide(
@@ -155,15 +163,18 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module)
     def begin_pass(
         first: int,
-        x_tilde: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
         fraction_out: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
         passes_out: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
         fraction_out[i] = scalar(1.0)
-        x_end_out[i] = x_tilde[i]
+        u_end_out[i] = u_tilde[i]
+        x_end_out[i] = base[i] + u_tilde[i]
         if i == 0:
             passes_out[0] = 0
             going_out[0] = 1
@@ -183,7 +194,7 @@ def kernels(real: Real) -> SimpleNamespace:
 class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
-    rigid: (first, last) vertex ranges of obstacles that must stay rigid. x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
+    rigid: (first, last) vertex ranges of obstacles that must stay rigid. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
     that each vertex keeps; passes: (1,) int32 on the device.
     """
 
@@ -192,16 +203,26 @@ class Truncation:
         self.kernels = kernels(real)
         self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.fraction = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.x_end = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         ranges = rigid if per_vertex else [(0, n)]
         self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
         self.rigid_end = wp.array(np.array([last for _, last in ranges], dtype=np.int32), device=device.warp)
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
 
-    def truncate(self, candidates: Candidates, x: wp.array, x_tilde: wp.array) -> None:
-        """Fills x_end and `passes`, the number of passes that found hits: 0 where the whole motion is free. Recordable."""
+    def truncate(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
+        """Fills u_end, x_end = base + u_end and `passes`, the number of passes that found hits: 0 where the whole motion is free.
+
+        base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
+        """
+        first = [self.fraction, self.u_end, self.x_end, self.passes, self.going]
+        self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, *first])
+        self.prove(candidates, base, u, u_tilde, x)
+
+    def prove(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
+        """The passes over the motion x -> x_end, with `fraction`, `u_end` and `x_end` as they are; `going` and `passes` say where to begin:
+        0 with all pairs, more with those of shortened vertices. Recordable.
+        """
         k, device, n = self.kernels, self.device, self.n
-        device.launch(k.begin_pass, n, [x_tilde, self.fraction, self.x_end, self.passes, self.going])
 
         def sweep() -> None:
             device.launch(k.reset, n, [self.multiplier, self.any_hit])
@@ -216,7 +237,8 @@ class Truncation:
         def shorten() -> None:
             if len(self.rigid_begin):
                 device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
-            device.launch(k.shorten, n, [self.multiplier, self.passes, x, x_tilde, self.fraction, self.x_end])
+            motion = [base, u, u_tilde, self.fraction, self.u_end, self.x_end]
+            device.launch(k.shorten, n, [self.multiplier, self.passes, *motion])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
 
