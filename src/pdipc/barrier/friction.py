@@ -79,6 +79,7 @@ def kernels(real: Real) -> SimpleNamespace:
         normals: wp.array(dtype=vec3),
         limit: wp.array(dtype=scalar),
         threshold: scalar,
+        project: wp.array(dtype=wp.int32),
         energy_out: wp.array(dtype=wp.float64),
         force_out: wp.array(dtype=vec3),
         block_out: wp.array(dtype=mat33),
@@ -100,7 +101,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 energy_out[k] = wp.float64(limit[k]) * wp.float64(length)
                 force_out[k] = -rate * s
                 h = rate * (mat33(wp.identity(n=3, dtype=scalar)) - wp.outer(n, n))
-                if size > zero:
+                # across the slip f1 / |u|, along it f1': nearly none once it slides, and Newton's step overshoots the kink at rest.
+                # f1 / |u| in all directions bounds D from above, so that it descends.
+                if size > zero and project[0] == 0:
                     t = s / size
                     h += (along - rate) * wp.outer(t, t)
                 block_out[k] = h
@@ -224,10 +227,12 @@ class FrictionTerm:
         inputs = [s.count, s.quads, s.weights, s.normals, s.gaps, s.activation, s.stiffness, s.coefficient, s.entries]
         device.launch_list(k.copy, self.capacity, [*inputs, self.quads, self.weights, self.normals, self.limit, self.entries])
 
-    def differentiate(self, u: wp.array) -> None:
-        """Launches energy, force and Hessian at the displacements u since the start of the step."""
+    def differentiate(self, u: wp.array, project: wp.array) -> None:
+        """Launches energy, force and Hessian at the displacements u since the start of the step; project: (1,) int32, whether the Hessian
+        is to be a bound that never overshoots.
+        """
         k, device = self.kernels, self.device
-        inputs = [self.count, u, self.quads, self.weights, self.normals, self.limit, self.threshold]
+        inputs = [self.count, u, self.quads, self.weights, self.normals, self.limit, self.threshold, project]
         result = [self.energy_of_pair, self.force, self.block]
         device.launch_list(k.evaluate, self.capacity, [*inputs, *result])
         inputs = [self.ends, self.entries, self.quads, self.weights, self.source.free, *result]

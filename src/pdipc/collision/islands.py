@@ -49,21 +49,22 @@ def kernels(real: Real):
         """The least body of each body's island; fixed: what attachments join from the start."""
         for a in range(bodies):
             label_out[a] = fixed[a]
-        going = int(1)
-        while going == 1:
-            going = 0
+        for _ in range(bodies):  # as many as a chain of all of them takes
+            changed = int(0)
             for a in range(bodies):
+                least = wp.min(label_out[a], label_out[fixed[a]])
+                if label_out[fixed[a]] != label_out[a]:
+                    changed += 1
+                label_out[fixed[a]] = least
+                label_out[a] = least
                 for b in range(a):
                     if near[a * bodies + b] == 1 and label_out[a] != label_out[b]:
-                        least = wp.min(label_out[a], label_out[b])
-                        label_out[a] = least
-                        label_out[b] = least
-                        going = 1
-                if label_out[fixed[a]] != label_out[a]:
-                    least = wp.min(label_out[fixed[a]], label_out[a])
-                    label_out[fixed[a]] = least
-                    label_out[a] = least
-                    going = 1
+                        low = wp.min(label_out[a], label_out[b])
+                        label_out[a] = low
+                        label_out[b] = low
+                        changed += 1
+            if changed == 0:
+                break
 
     @wp.kernel(module=module)
     def mark_driven(

@@ -127,6 +127,7 @@ def kernels(real: Real) -> SimpleNamespace:
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
         fraction: wp.array(dtype=scalar),
+        first_fraction: wp.array(dtype=scalar),
         u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
     ):
@@ -140,6 +141,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 # not settled: these stay where they are, and the next outer iteration starts from a stronger barrier
                 f = scalar(0.0)
             fraction[i] = f
+            if passes[0] == 0:
+                first_fraction[i] = f
             u_end_out[i] = u[i] + f * (u_tilde[i] - u[i])
         if passes[0] >= MAX_PASSES:
             # nobody moves, which is always feasible
@@ -166,6 +169,7 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
         fraction_out: wp.array(dtype=scalar),
+        first_fraction_out: wp.array(dtype=scalar),
         u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
         passes_out: wp.array(dtype=wp.int32),
@@ -173,6 +177,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         i = first + wp.tid()
         fraction_out[i] = scalar(1.0)
+        first_fraction_out[i] = scalar(1.0)
         u_end_out[i] = u_tilde[i]
         x_end_out[i] = base[i] + u_tilde[i]
         if i == 0:
@@ -195,14 +200,14 @@ class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
     rigid: (first, last) vertex ranges of obstacles that must stay rigid. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
-    that each vertex keeps; passes: (1,) int32 on the device.
+    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
     def __init__(self, device: Device, real: Real, n: int, rigid: list[tuple[int, int]], per_vertex: bool = True):
         self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
         self.kernels = kernels(real)
         self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
-        self.fraction = wp.zeros(n, dtype=real.scalar, device=device.warp)
+        self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
         self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         ranges = rigid if per_vertex else [(0, n)]
         self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
@@ -214,7 +219,7 @@ class Truncation:
 
         base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
         """
-        first = [self.fraction, self.u_end, self.x_end, self.passes, self.going]
+        first = [self.fraction, self.first_fraction, self.u_end, self.x_end, self.passes, self.going]
         self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, *first])
         self.prove(candidates, base, u, u_tilde, x)
 
@@ -237,7 +242,7 @@ class Truncation:
         def shorten() -> None:
             if len(self.rigid_begin):
                 device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
-            motion = [base, u, u_tilde, self.fraction, self.u_end, self.x_end]
+            motion = [base, u, u_tilde, self.fraction, self.first_fraction, self.u_end, self.x_end]
             device.launch(k.shorten, n, [self.multiplier, self.passes, *motion])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))

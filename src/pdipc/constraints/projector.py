@@ -138,8 +138,10 @@ class Projector:
         self._sum.sum(self.energies, self._total)
         self.device.launch_serial(self._kernels.store, [self._total, slot, out])
 
-    def differentiate(self, base: wp.array, u: wp.array) -> None:
-        """Fills `blocks`: the Hessians at x = base + u, each positive semidefinite. Recordable."""
+    def differentiate(self, base: wp.array, u: wp.array, project: wp.array) -> None:
+        """Fills `blocks`: the Hessians at x = base + u; project: (1,) int32 on the device, whether each is to be positive semidefinite.
+        Recordable.
+        """
         for kind, count, arrays, _, _, block in self._batches:
             if hasattr(kind, "hessian"):
-                self.device.launch(kind.hessian, count, [*arrays, base, u, block, self.blocks], grain=64)
+                self.device.launch(kind.hessian, count, [*arrays, base, u, block, project, self.blocks], grain=64)

@@ -106,16 +106,20 @@ def kernels(real: Real, module: wp.Module, corners: int, project_of: Callable[[R
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         offset: int,
+        project: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=mat33),
     ):
-        """w g_a g_b (d d^T + max(0, 1 - L / |q|) (I - d d^T)), q = G x and d = q / |q|: one along it, and across what tension gives."""
+        """w g_a g_b (d d^T + (1 - L / |q|) (I - d d^T)), q = G x and d = q / |q|: one along it, and
+        across what tension gives, or compression takes, which projection drops."""
         e = first + wp.tid()
         q = combined(base, u, vertices[e], g[e])
         size = wp.length(q)
         h = mat33(wp.identity(n=3, dtype=scalar))
         if size > scalar(0.0):
             d = q / size
-            across = wp.max(scalar(0.0), scalar(1.0) - length[e] / size)
+            across = scalar(1.0) - length[e] / size
+            if project[0] != 0:
+                across = wp.max(scalar(0.0), across)
             h = across * h + (scalar(1.0) - across) * wp.outer(d, d)
         elif length[e] > scalar(0.0):
             h = mat33()

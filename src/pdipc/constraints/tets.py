@@ -3,8 +3,8 @@
 A kind brings two functions. `stress(F, mu, lame)` is its first Piola-Kirchhoff stress over the weight. `principal(s, mu, lame)` is its
 energy's second derivative in terms of the signed singular values s of F = U diag(s) V^T (Smith, de Goes, Kim 2019, Analytic
 Eigensystems for Isotropic Distortion Energies): the 3x3 matrix W_ij over the stretches, and for each pair of axes, named by the
-third, what twisting them costs, (W_i + W_j) / (s_i + s_j), and flipping them, (W_i - W_j) / (s_i - s_j). Negative eigenvalues are
-set to zero, so that the matrix is positive semidefinite.
+third, what twisting them costs, (W_i + W_j) / (s_i + s_j), and flipping them, (W_i - W_j) / (s_i - s_j). These are the eigenvalues:
+projection sets the negative ones to zero.
 """
 
 import functools
@@ -178,22 +178,26 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         offset: int,
+        project: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=mat33),
     ):
-        """The ten blocks of corners a <= b, positive semidefinite as a whole."""
+        """The ten blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         b = inverse[e]
         s, turn, axes = f_of.singular_values(f_of.deformation(base, u, vertices[e], b))
         stretch, twist, flip = principal(s, modulus[e][0], modulus[e][1])
         w = weight[e]
-        stretch = w * eig.positive_part(stretch)
+        if project[0] != 0:
+            stretch = eig.positive_part(stretch)
+            for k in range(3):
+                twist[k] = wp.max(twist[k], zero)
+                flip[k] = wp.max(flip[k], zero)
+        stretch = w * stretch
         p = vec3()
         q = vec3()
         for k in range(3):
-            t = wp.max(twist[k], zero)
-            l = wp.max(flip[k], zero)
-            p[k] = half * w * (l + t)
-            q[k] = half * w * (l - t)
+            p[k] = half * w * (flip[k] + twist[k])
+            q[k] = half * w * (flip[k] - twist[k])
         g = b * axes  # row c: the gradient of corner c + 1 in the axes of the singular values
         g1 = vec3(g[0, 0], g[0, 1], g[0, 2])
         g2 = vec3(g[1, 0], g[1, 1], g[1, 2])

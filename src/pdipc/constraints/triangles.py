@@ -151,9 +151,10 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         offset: int,
+        project: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=mat33),
     ):
-        """The six blocks of corners a <= b, positive semidefinite as a whole."""
+        """The six blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         b = inverse[e]
         f = f_of.deformation(base, u, vertices[e], b)
@@ -181,7 +182,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         mean = half * (k[0] + k[2])
         spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
         low = mean - spread
-        if low < zero:
+        if low < zero and project[0] != 0:
             high = wp.max(mean + spread, zero)
             # high times the projector on its eigenvector
             cosine = zero
@@ -192,11 +193,15 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
             k = half * high * vec3(one + cosine, sine, one - cosine)
         w = weight[e]
         k = w * k
-        t = wp.max(pair[0], zero)
-        l = wp.max(pair[1], zero)
+        t = pair[0]
+        l = pair[1]
+        if project[0] != 0:
+            t = wp.max(t, zero)
+            l = wp.max(l, zero)
+            tilt = vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
         p = half * w * (l + t)
         q = half * w * (l - t)
-        out = w * vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
+        out = w * tilt
         g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
         g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])
         g0 = -(g1 + g2)

@@ -37,7 +37,7 @@ class BlockPcg:
     """Solves K p = b on the free vertices by launches alone.
 
     tolerance: relative, of sqrt(r . M^-1 r). most: iterations of a solve. iterations: (1,) int32 on the device, done since it was last set to
-    zero. spare: (n,) vec3, a vector whose entries are free for use outside of a solve.
+    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, and ended there.
     """
 
     def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, tolerance: float, most: int):
@@ -56,6 +56,7 @@ class BlockPcg:
         self._numbers, self._partial = zeros(scalar, 3), zeros(scalar, self.sums.slots)
         self._first, self._residual = zeros(scalar, 1), zeros(scalar, 1)
         self.iterations, self._left, self._going = zeros(wp.int32, 1), zeros(wp.int32, 1), zeros(wp.int32, 1)
+        self.indefinite = zeros(wp.int32, 1)
         self._steps = wp.zeros((most, 2), dtype=scalar, device=device.warp)
         self._kernels, self._pcg = kernels(real), pcg.kernels(real)
         self._advance = _advance_kernel(real)
@@ -83,13 +84,13 @@ class BlockPcg:
             c.apply(p, self._w)
         self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
         self._precondition()
-        sums.conclude(k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status])
+        sums.conclude(k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite])
 
         def iterate() -> None:
             for c in contacts:
                 c.apply(self._u, self._w)
             sums.launch(k.multiply, [*rows, self._free, self._u, self._w, self._partial])
-            sums.conclude(self._pcg.find_alpha, [self._partial, sums.slots, self._numbers, self._left])
+            sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])
             sums.launch(self._advance, [self._numbers, 1, self._w, self._u, self._p, self._s, p, self._r])
             self._precondition()
             sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits, *status])
@@ -196,6 +197,7 @@ def kernels(real: Real) -> SimpleNamespace:
         iterations: wp.array(dtype=wp.int32),
         residual_out: wp.array(dtype=scalar),
         going_out: wp.array(dtype=wp.int32),
+        indefinite_out: wp.array(dtype=wp.int32),
     ):
         lane = first + wp.tid()
         gamma = f.sum_partials(partial, slots, lane)
@@ -208,9 +210,32 @@ def kernels(real: Real) -> SimpleNamespace:
             first_out[0] = reference
             left_out[0] = most
             residual_out[0] = norm / reference
+            indefinite_out[0] = 0
             going_out[0] = 0
             if norm > tolerance * reference or not wp.isfinite(gamma):
                 going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def find_alpha(
+        first: int,
+        partial: wp.array(dtype=scalar),
+        slots: int,
+        numbers: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
+        indefinite_out: wp.array(dtype=wp.int32),
+    ):
+        """alpha; where the curvature along the direction is negative, no step, the end, and a note of it."""
+        lane = first + wp.tid()
+        delta = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            gamma = numbers[pcg.GAMMA]
+            curvature = delta - numbers[pcg.BETA] * gamma / numbers[pcg.ALPHA]
+            if curvature > scalar(0.0) or wp.isnan(curvature):
+                numbers[pcg.ALPHA] = gamma / curvature
+            else:
+                numbers[pcg.ALPHA] = scalar(0.0)
+                left[0] = 1
+                indefinite_out[0] = 1
 
     @wp.kernel(module=module)
     def multiply(
@@ -264,4 +289,4 @@ def kernels(real: Real) -> SimpleNamespace:
                 gamma += wp.dot(residual, u)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(clear=clear, invert_diagonal=invert_diagonal, start=start, begin=begin, multiply=multiply, correct=correct)
+    return SimpleNamespace(clear=clear, invert_diagonal=invert_diagonal, start=start, begin=begin, find_alpha=find_alpha, multiply=multiply, correct=correct)

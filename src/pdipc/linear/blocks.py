@@ -29,7 +29,7 @@ class Hessians(Protocol):
     bending: list
     blocks: wp.array
 
-    def differentiate(self, base: wp.array, u: wp.array) -> None: ...
+    def differentiate(self, base: wp.array, u: wp.array, project: wp.array) -> None: ...
 
 
 class BlockMatrix:
@@ -95,10 +95,10 @@ class BlockMatrix:
         self._scalars = upload(scalars, real.scalar)
         self._kernels = kernels(real)
 
-    def assemble(self, base: wp.array, u: wp.array) -> None:
-        """Launches the values at x = base + u."""
+    def assemble(self, base: wp.array, u: wp.array, project: wp.array) -> None:
+        """Launches the values at x = base + u; project: see `Hessians`."""
         k, device = self._kernels, self.device
-        self.projector.differentiate(base, u)
+        self.projector.differentiate(base, u, project)
         inputs = [self._starts, self._slots, self._scalars, self.projector.blocks, self.values]
         device.launch(k.gather, self.nnz, inputs, grain=16)
         device.launch(k.gather_diagonal, self.count, [self.offsets, self.held, self.values, self.diagonal], grain=32)

@@ -232,7 +232,7 @@ def kernels(real: Real) -> SimpleNamespace:
             f = scalar(0.5) * fraction[i]
             shortest = least[label[b]]
             if attempts[0] == 1 and shortest < scalar(1.0):
-                f = wp.min(fraction[i], shortest)
+                f = shortest
             if attempts[0] >= HALVINGS:
                 f = scalar(0.0)
             fraction[i] = f
@@ -297,6 +297,29 @@ def kernels(real: Real) -> SimpleNamespace:
         flag_out[0] = 0
 
     @wp.kernel(module=module)
+    def set_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
+        flag_out[0] = 1
+
+    @wp.kernel(module=module)
+    def choose(
+        first: int,
+        hits: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        project_out: wp.array(dtype=wp.int32),
+    ):
+        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads."""
+        project_out[0] = 1
+        if count[status.OUTER] > 0 and hits[0] == 0 and attempts[0] == 1:
+            project_out[0] = 0
+
+    @wp.kernel(module=module)
+    def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
+        i = first + wp.tid()
+        if free[i] > scalar(0.0):
+            p[i] = vec3()
+
+    @wp.kernel(module=module)
     def start(
         first: int,
         drive_out: wp.array(dtype=wp.int32),
@@ -338,6 +361,12 @@ def kernels(real: Real) -> SimpleNamespace:
         residual = numbers[status.MOVED]
         behind = numbers[status.LAG] > scalar(0.0)
         driven = drive[0] != 0
+        # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes
+        ratio = scalar(0.0)
+        if count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        numbers[status.MOVED_BEFORE] = residual
         if overflow[0] != 0:
             code = status.OVERFLOW
         else:
@@ -352,7 +381,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if driven:
                 count[status.DRIVEN] = count[status.DRIVEN] + 1
-            settled = residual <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
+            settled = left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind:
@@ -442,8 +471,8 @@ class Newton:
         self.before, self.after = zeros(wp.float64, self.bodies), zeros(wp.float64, self.bodies)
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted = zeros(wp.int32, self.bodies)
-        self.attempts, self.searching, self.hits, self.drive, self.lagging, self.crowded, self.still = (
-            zeros(wp.int32, 1) for _ in range(7)
+        self.attempts, self.searching, self.hits, self.drive, self.lagging, self.crowded, self.still, self.project = (
+            zeros(wp.int32, 1) for _ in range(8)
         )
         self.largest = Reducer(device, real, n)
         lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
@@ -491,7 +520,7 @@ class Newton:
         self.model.projector.evaluate(w.x_start, u)
         self.base_sums.add([self.model.projector.energies, self.vertex_energy], self.base_new)
         if self.friction is not None:
-            self.friction.differentiate(u)
+            self.friction.differentiate(u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_new)
 
     def _keep_energies(self) -> None:
@@ -501,9 +530,10 @@ class Newton:
     def freeze(self) -> None:
         """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
         w = self.work
+        self.device.launch_serial(self.kernels.choose, [self.hits, self.attempts, w.count, self.project])
         if self.friction is not None:
             self.device.when(self._lags_now(), self.friction.lag)
-            self.friction.differentiate(w.u)
+            self.friction.differentiate(w.u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
 
     def _lags_now(self) -> wp.array:
@@ -513,24 +543,38 @@ class Newton:
     def solve(self) -> None:
         """Lines 6 to 12: x~ = x + p with K p = -grad Phi."""
         w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
-        self.matrix.assemble(w.x_start, w.u)
         model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
         friction = None if self.friction is None else self.friction.force_of_vertex
         where = [w.u, w.x_start, w.target, model.free, self.drive]
         device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
-        contacts = self._contacts()
-        self.solver.prepare(w.x, contacts)
-        self.solver.solve(self.p, self.rhs, contacts, self.tolerated)
+        self._solve_linear()
+        device.when(self.solver.indefinite, self._solve_projected)
         inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
         self.largest.max(self.moved, self.numbers, status.MOVED)
         self.largest.max(self.forces, self.numbers, status.FORCE)
         self.largest.max(self.scales, self.numbers, status.FORCE_SCALE)
 
+    def _solve_linear(self) -> None:
+        w, contacts = self.work, self._contacts()
+        self.matrix.assemble(w.x_start, w.u, self.project)
+        self.solver.prepare(w.x, contacts)
+        self.solver.solve(self.p, self.rhs, contacts, self.tolerated)
+
+    def _solve_projected(self) -> None:
+        """Anew, with every element's Hessian positive semidefinite."""
+        w, k = self.work, self.kernels
+        self.device.launch_serial(k.set_flag, [self.project])
+        self.device.launch(k.restart, self.model.vertex_count, [self.model.free, self.p])
+        if self.friction is not None:
+            self.friction.differentiate(w.u, self.project)
+        self._solve_linear()
+
     def correct(self, r: Restitution) -> None:
         """The velocities of restitution, `r.u_now`, by one step: the correction is small beside what bends an element."""
         w, model, n = self.work, self.model, self.model.vertex_count
-        self.matrix.assemble(w.x_start, w.u)
+        self.device.launch_serial(self.kernels.set_flag, [self.project])
+        self.matrix.assemble(w.x_start, w.u, self.project)
         r.linearize_exact(w.rest)
         self.device.launch(self.kernels.begin, n, [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p])
         self.solver.prepare(w.x, [self.pairs])
@@ -555,7 +599,7 @@ class Newton:
 
         def search() -> None:
             if self.bodies:
-                inputs = [self.starts, self.ends, model.free, t.fraction, self.least]
+                inputs = [self.starts, self.ends, model.free, t.first_fraction, self.least]
                 device.launch(k.least_fraction, self.bodies, inputs, grain=1000)
                 device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
             which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]

@@ -13,5 +13,5 @@ COUNTS = 9
 
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
 # the largest force of inertia, to compare it with; how far something scripted is behind, m
-MOVED, FORCE, FORCE_SCALE, LAG = (wp.constant(place) for place in range(4))
-NUMBERS = 4
+MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE = (wp.constant(place) for place in range(5))
+NUMBERS = 5
