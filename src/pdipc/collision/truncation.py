@@ -25,6 +25,8 @@ FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
 LATER_BACKOFF = 0.1  # in the passes that check shortened motions
 SHRINK = 0.9
 STUBBORN = 20  # passes after which vertices that still hit something stay where they are
+GRADE = 0.1  # strain that an edge may take from a truncation, where neighbours are known
+RINGS = 12  # of neighbours, over which a short motion is felt
 MAX_PASSES = 60  # and after which all do
 
 
@@ -123,13 +125,8 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         multiplier: wp.array(dtype=wp.int32),
         passes: wp.array(dtype=wp.int32),
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        u_tilde: wp.array(dtype=vec3),
         fraction: wp.array(dtype=scalar),
         first_fraction: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
         if multiplier[i] < unit:
@@ -143,12 +140,46 @@ def kernels(real: Real) -> SimpleNamespace:
             fraction[i] = f
             if passes[0] == 0:
                 first_fraction[i] = f
-            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i])
         if passes[0] >= MAX_PASSES:
             # nobody moves, which is always feasible
             fraction[i] = scalar(0.0)
-            u_end_out[i] = u[i]
-        x_end_out[i] = base[i] + u_end_out[i]
+
+    @wp.kernel(module=module)
+    def grade(
+        first: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        fraction_out: wp.array(dtype=scalar),
+    ):
+        """No vertex keeps so much more of its motion than a neighbour that the edge between them is strained by more than GRADE."""
+        i = first + wp.tid()
+        f = fraction[i]
+        own = wp.length(u_tilde[i] - u[i])
+        for e in range(offsets[i], offsets[i + 1]):
+            j = columns[e]
+            if fraction[j] < f:
+                motion = wp.max(own, wp.length(u_tilde[j] - u[j]))
+                f = wp.min(f, fraction[j] + scalar(GRADE) * wp.length(x[j] - x[i]) / wp.max(motion, scalar(1.0e-30)))
+        fraction_out[i] = f
+
+    @wp.kernel(module=module)
+    def place(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
+        x_end_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        if fraction[i] < scalar(1.0):
+            u_end_out[i] = u[i] + fraction[i] * (u_tilde[i] - u[i])
+            x_end_out[i] = base[i] + u_end_out[i]
 
     @wp.kernel(module=module)
     def decide(
@@ -191,6 +222,8 @@ def kernels(real: Real) -> SimpleNamespace:
         spread=spread,
         together=together,
         shorten=shorten,
+        grade=grade,
+        place=place,
         decide=decide,
         begin_pass=begin_pass,
     )
@@ -199,7 +232,8 @@ def kernels(real: Real) -> SimpleNamespace:
 class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
-    rigid: (first, last) vertex ranges of obstacles that must stay rigid. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
+    rigid: (first, last) vertex ranges of obstacles that must stay rigid. neighbours: offsets (n + 1,) and columns of those that elasticity
+    connects, or None. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
     that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
@@ -210,6 +244,8 @@ class Truncation:
         self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
         self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         ranges = rigid if per_vertex else [(0, n)]
+        self.neighbours: list[wp.array] | None = None
+        self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
         self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
         self.rigid_end = wp.array(np.array([last for _, last in ranges], dtype=np.int32), device=device.warp)
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
@@ -242,8 +278,12 @@ class Truncation:
         def shorten() -> None:
             if len(self.rigid_begin):
                 device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
-            motion = [base, u, u_tilde, self.fraction, self.first_fraction, self.u_end, self.x_end]
-            device.launch(k.shorten, n, [self.multiplier, self.passes, *motion])
+            device.launch(k.shorten, n, [self.multiplier, self.passes, self.fraction, self.first_fraction])
+            if self.neighbours is not None:
+                for _ in range(RINGS // 2):
+                    for before, after in ((self.fraction, self.graded), (self.graded, self.fraction)):
+                        device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
+            device.launch(k.place, n, [base, u, u_tilde, self.fraction, self.u_end, self.x_end])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
 

@@ -440,6 +440,7 @@ class Newton:
         held = model.held
         self.matrix = BlockMatrix(device, real, model.projector, held, free)
         self.solver = BlockPcg(device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
+        work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
         simulated = [body for body in assembly.bodies if not body.kinematic]
         ranges = [(body.first, body.last) for body in simulated]
         joined = np.array(
