@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from pdipc.collision import ccd
+from pdipc.collision import ccd, distance
 from pdipc.collision.candidates import Candidates
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real, kernel
@@ -25,6 +25,7 @@ FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
 LATER_BACKOFF = 0.1  # in the passes that check shortened motions
 SHRINK = 0.9
 STUBBORN = 20  # passes after which vertices that still hit something stay where they are
+DEEP = 0.5  # of d_hat: a pair that is hit at a smaller gap was squeezed before
 GRADE = 0.1  # strain that an edge may take from a truncation, where neighbours are known
 RINGS = 12  # of neighbours, over which a short motion is felt
 MAX_PASSES = 60  # and after which all do
@@ -34,7 +35,7 @@ MAX_PASSES = 60  # and after which all do
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
     module = real.module(__name__)
-    c = ccd.functions(real)
+    c, dist = ccd.functions(real), distance.functions(real)
     unit = wp.constant(UNIT)
 
     def sweep(kind: str):
@@ -50,8 +51,10 @@ def kernels(real: Real) -> SimpleNamespace:
             passes: wp.array(dtype=wp.int32),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
+            island_of: wp.array(dtype=wp.int32),
             time_out: wp.array(dtype=wp.int32),
             hits_out: wp.array(dtype=wp.int32),
+            deep_out: wp.array(dtype=wp.int32),
         ):
             worker = span.first + wp.tid()
             backoff = scalar(FIRST_BACKOFF)
@@ -79,6 +82,18 @@ def kernels(real: Real) -> SimpleNamespace:
                         if t <= scalar(1.0):
                             time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
                             hits += 1
+                            if passes[0] == 0:
+                                apart = scalar(0.0)
+                                if wp.static(edge_edge):
+                                    apart = dist.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                else:
+                                    apart = dist.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                if apart - xi < scalar(DEEP) * limits[k][1]:
+                                    # whoever writes, writes the same
+                                    if island_of[q[0]] >= 0:
+                                        deep_out[island_of[q[0]]] = 1
+                                    if island_of[q[3]] >= 0:
+                                        deep_out[island_of[q[3]]] = 1
                     time_out[k] = time
                 hits_out[begin // span.block] = hits
 
@@ -90,6 +105,10 @@ def kernels(real: Real) -> SimpleNamespace:
         multiplier_out[i] = unit
         if i == 0:
             any_hit_out[0] = 0
+
+    @wp.kernel(module=module)
+    def clear(first: int, values_out: wp.array(dtype=wp.int32)):
+        values_out[first + wp.tid()] = 0
 
     @wp.kernel(module=module)
     def spread(
@@ -219,6 +238,7 @@ def kernels(real: Real) -> SimpleNamespace:
         sweep_vertex_triangle=sweep("vertex_triangle"),
         sweep_edge_edge=sweep("edge_edge"),
         reset=reset,
+        clear=clear,
         spread=spread,
         together=together,
         shorten=shorten,
@@ -233,7 +253,8 @@ class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
     rigid: (first, last) vertex ranges of obstacles that must stay rigid. neighbours: offsets (n + 1,) and columns of those that elasticity
-    connects, or None. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
+    connects, or None. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
+    set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
     that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
@@ -244,6 +265,9 @@ class Truncation:
         self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
         self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         ranges = rigid if per_vertex else [(0, n)]
+        self.body_count = 0
+        self.body = wp.full(n, -1, dtype=wp.int32, device=device.warp)
+        self.deep = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.neighbours: list[wp.array] | None = None
         self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
         self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
@@ -255,6 +279,8 @@ class Truncation:
 
         base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
         """
+        if self.body_count:
+            self.device.launch(self.kernels.clear, self.body_count, [self.deep])
         first = [self.fraction, self.first_fraction, self.u_end, self.x_end, self.passes, self.going]
         self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, *first])
         self.prove(candidates, base, u, u_tilde, x)
@@ -268,7 +294,7 @@ class Truncation:
         def sweep() -> None:
             device.launch(k.reset, n, [self.multiplier, self.any_hit])
             for c in candidates.lists:
-                inputs = [c.count, x, self.x_end, self.fraction, self.passes, c.quads, c.limits, c.times, c.found]
+                inputs = [c.count, x, self.x_end, self.fraction, self.passes, c.quads, c.limits, self.body, c.times, c.found, self.deep]
                 device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
                 inputs = [c.count, c.quads, c.times, c.found, self.multiplier, self.any_hit]
                 device.launch_scatter(k.spread, c.capacity, inputs)

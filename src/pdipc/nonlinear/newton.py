@@ -142,6 +142,7 @@ def kernels(real: Real) -> SimpleNamespace:
         bodies: int,
         label: wp.array(dtype=wp.int32),
         driven: wp.array(dtype=wp.int32),
+        deep: wp.array(dtype=wp.int32),
         base_old: wp.array(dtype=wide),
         friction_old: wp.array(dtype=wide),
         base_new: wp.array(dtype=wide),
@@ -149,16 +150,21 @@ def kernels(real: Real) -> SimpleNamespace:
         overflow: wp.array(dtype=wp.int32),
         before: wp.array(dtype=wide),
         after: wp.array(dtype=wide),
+        squeezed: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         accepted_out: wp.array(dtype=wp.int32),
         searching_out: wp.array(dtype=wp.int32),
     ):
-        """Whether the potential of each island has not risen. before, after: (bodies,) scratch."""
+        """Whether the potential of each island has not risen. before, after, squeezed: (bodies,)
+        scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
         for b in range(bodies):
             before[b] = wide(0.0)
             after[b] = wide(0.0)
             accepted_out[b] = 0
+            squeezed[b] = 0
         for b in range(bodies):
+            if deep[b] != 0:
+                squeezed[label[b]] = 1
             before[label[b]] = before[label[b]] + base_old[b] + friction_old[b]
             after[label[b]] = after[label[b]] + base_new[b] + friction_new[b]
             if driven[b] != 0:
@@ -169,6 +175,8 @@ def kernels(real: Real) -> SimpleNamespace:
             ok = accepted_out[island]
             if after[island] <= before[island] + slack * wp.abs(before[island]) or attempts[0] > HALVINGS:
                 ok = 1
+            if squeezed[island] != 0 and attempts[0] == 0:
+                ok = 0
             accepted_out[b] = ok
             if ok == 0:
                 searching = 1
@@ -449,6 +457,8 @@ class Newton:
         inside = assembly.body_of_vertex < len(simulated)
         pinned = np.flatnonzero(inside & ~free)
         self.islands = Islands(device, real, n, ranges, joined, pinned)
+        work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
+        work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
         owner = np.where(inside, assembly.body_of_vertex, -1)
         of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
         elements = np.concatenate([*of_elements, np.zeros(0, dtype=owner.dtype)])
@@ -471,10 +481,11 @@ class Newton:
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after = zeros(wp.float64, self.bodies), zeros(wp.float64, self.bodies)
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
-        self.accepted = zeros(wp.int32, self.bodies)
+        self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
         self.attempts, self.searching, self.hits, self.drive, self.lagging, self.crowded, self.still, self.project = (
             zeros(wp.int32, 1) for _ in range(8)
         )
+        self.pairs.project = self.project
         self.largest = Reducer(device, real, n)
         lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -594,8 +605,8 @@ class Newton:
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
         self._evaluate(t.u_end, t.x_end)
         energies = [self.base_old, self.friction_old, self.base_new, self.friction_new, w.candidates.overflow]
-        judged = [self.before, self.after, self.attempts, self.accepted, self.searching]
-        judging = [self.bodies, self.islands.label, self.islands.driven, *energies, *judged]
+        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.searching]
+        judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
         device.launch_serial(k.judge, judging)
 
         def search() -> None:
