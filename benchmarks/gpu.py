@@ -1,367 +1,184 @@
-"""One command for a machine with a GPU: checks CUDA against the CPU, then times it: `python benchmarks/gpu.py [-o FILE]`.
+"""One command for a machine with a GPU: checks CUDA against the CPU, then times it: `python benchmarks/gpu.py [-o FOLDER]`.
 
-It needs a checkout and the package's own dependencies; the package need not be installed. It checks that solvers, CCD and whole steps give on CUDA what they give on the CPU, that
-two runs give the same bits, and recorded steps those of single launches. Then it times the solvers over sizes (Fig. 8), CCD, the
-benchmark scenes stage by stage, the authors' Armadillo (Table 1) where the optional data is there, and says how near the solver's
-sweep comes to a measured copy. It ends within nine minutes: what no longer fits is left out, and the JSON says so. Each part is
-a process of its own, and the JSON is written row by row: a part that breaks, hangs or spoils the GPU's context costs no other.
+It needs a checkout and the package's own dependencies; the package need not be installed. Parts by name (--only), in order of worth: bundled
+scenes step on CUDA as on the CPU, with the same bits again, and without intersections (`scenes`); kernels against the CPU (`kernels`,
+`ccd`) and solvers against SciPy (`solvers`); then times of the peers' scenes, of the bundled ones, of CCD and of the solvers
+(Fig. 8), and each kernel's own.
 
-Exit code 0: all is well; 1: a check failed or a part broke; 2: no CUDA device. `--device cpu --small` tries the command itself.
+A machine that is lent for minutes should neither compile nor compute references: `--prepare FOLDER --arch 90` does both where there is
+no GPU, and `--carried FOLDER` uses them there. No Warp compiler for the CPU is needed then.
+
+Results are lines of gpu.jsonl, written as they come, and at the end gpu.json. Each part is a process of its own with a limit of time
+for each of its cases: what breaks or hangs is told with its traceback, and the part goes on with the next case in a new process.
+
+Exit code 0: all is well; 1: a check failed or a case broke; 2: no CUDA device. `--device cpu --small` tries the command itself.
 """
 
 import argparse
 import datetime
-import functools
+import faulthandler
 import json
+import os
 import platform
-import re
-import statistics
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse.linalg as spla
 import warp as wp
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(REPOSITORY / folder) for folder in ("src", ".", "benchmarks")]
+sys.path[:0] = [str(REPOSITORY / folder) for folder in ("src", ".", "benchmarks", "tests/collision")]
 
-import pdipc  # noqa: E402
+import gpu_checks as checks  # noqa: E402
+import gpu_times as times  # noqa: E402
+
 from pdipc.device.launch import Device  # noqa: E402
-from pdipc.device.precision import Real, real  # noqa: E402
-from pdipc.drive import Work, step  # noqa: E402
-from pdipc.linear import make_solver  # noqa: E402
-from pdipc.linear.solvers import SOLVERS  # noqa: E402
-from pdipc.reproduce import _common, fig8  # noqa: E402
-from pdipc.reproduce.armadillo import authors_scene  # noqa: E402
-from pdipc.reproduce.fig7 import Run, loads, table_cloth  # noqa: E402
-from tests.contact import hard_queries  # noqa: E402
 
-BUDGET = 9 * 60 - 20  # s, with some left for the end
-SIDES = (41, 71, 100, 183, 316, 577)  # cloths of 5K to 1M DOF
-SOLVER_TOLERANCE = {"float64": 1e-8, "float32": 2e-3}  # relative distance to the direct solution, converged as far as it goes
-STEP_TOLERANCE = 1e-3  # of the scene size, after STEPS steps: a step has converged at 1e-4 of it
-STEPS = 12
-CHECKED_SCENES = ("box_stack", "cloth_on_sphere", "thin_rod")
+BUDGET = 6 * 60  # s
+START = 20.0  # s that a process may take to begin
+GRACE = 5.0  # s that a case may take longer than its limit before its process is ended
 
 
 class Report:
-    """What one part found: rows, and checks with the number measured and what it must not exceed; kept in a file as they come.
+    """Rows and checks of one case, appended to a file of JSON lines as they come. seconds: what the case may take."""
 
-    budget: seconds that the part may take.
-    """
-
-    def __init__(self, budget: float, path: Path | None = None):
-        self.begun, self.budget, self.path = time.perf_counter(), budget, path
-        self.checks: list[dict] = []
-        self.rows: list[dict] = []
+    def __init__(self, path: Path, part: str, case: str, seconds: float):
+        self.path, self.of, self.begun, self.seconds = path, {"part": part, "case": case}, time.perf_counter(), seconds
 
     def left(self) -> float:
-        """Seconds of the budget that are left."""
-        return self.budget - (time.perf_counter() - self.begun)
+        """Seconds that are left to the case."""
+        return self.seconds - (time.perf_counter() - self.begun)
 
     def check(self, name: str, found: float, limit: float) -> None:
         """A number that must not be larger than its limit; not a number fails."""
         passed = bool(found <= limit)
-        self.checks.append({"check": name, "found": float(found), "limit": limit, "passed": passed})
-        print(f"  {'ok  ' if passed else 'FAIL'} {name}: {found:.3g} (at most {limit:g})", flush=True)
-        self._keep()
+        print(f"  {'ok  ' if passed else 'FAIL'} {self.of['case']}: {name}: {found:.3g} (at most {limit:g})", flush=True)
+        self.add(check=name, found=float(found), limit=limit, passed=passed)
 
     def add(self, **row) -> None:
-        """A row of the part's table."""
-        self.rows.append(row)
-        self._keep()
-
-    def attempt(self, name: str, work: Callable[[], object]) -> None:
-        """One case of several: what breaks it is noted, fails the report, and leaves the others their turn."""
-        try:
-            work()
-        except Exception as error:
-            traceback.print_exc()
-            self.add(case=name, broken=f"{type(error).__name__}: {error}")
-
-    def _keep(self) -> None:
-        if self.path is not None:
-            whole = self.path.with_suffix(".new")
-            whole.write_text(json.dumps({"checks": self.checks, "rows": self.rows}))
-            whole.replace(self.path)  # at no time is half a file there
+        """A line of the part's results."""
+        line = json.dumps(self.of | row) + "\n"
+        with self.path.open("a") as file:  # one write: other processes append to it, too
+            file.write(line)
 
 
-def sound(parts: dict[str, dict]) -> bool:
-    """Whether every check of every part passed and nothing broke."""
-    broken = any("broken" in part or any("broken" in row for row in part["rows"]) for part in parts.values())
-    return not broken and all(check["passed"] for part in parts.values() for check in part["checks"])
+@dataclass(frozen=True)
+class Part:
+    """run(report, device, case, carried) does one of `cases(small)`. seconds: what a case may take. together: whether cases may share
+    the GPU, as those may that time nothing."""
+
+    run: Callable[[Report, Device, str, Path | None], None]
+    cases: Callable[[bool], list[str]]
+    seconds: float
+    together: bool = False
 
 
-# --- CUDA gives what the CPU gives ---
-
-
-def check_solvers(report: Report, place: Device, side: int) -> None:
-    """Every solver against SciPy's direct solution of a cloth."""
-    for precision, limit in SOLVER_TOLERANCE.items():
-        system, mass, _ = table_cloth(side, place, real(precision))
-        b = loads(system, mass)["sharp force"]
-        free, expected = system.free, np.zeros_like(b)
-        expected[free] = spla.spsolve(system.matrix[free][:, free].tocsc(), b[free])
-        right = wp.array(b.astype(system.real.numpy), dtype=system.real.vec3, device=place.warp)
-        for name in SOLVERS:
-
-            def one(name=name, precision=precision, limit=limit, system=system, right=right, expected=expected) -> None:
-                options = {"weight": 0.5} if name == "jacobi" else {}
-                tolerance = 1e-11 if precision == "float64" else 1e-6
-                solver = make_solver(name, system, tolerance=tolerance, max_iterations=40_000, **options)
-                x = wp.zeros(system.count, dtype=system.real.vec3, device=place.warp)
-                if solver.recordable and place.records_loops:
-                    place.capture(lambda: solver.solve(x, right), solver).launch()
-                else:
-                    solver.solve(x, right)
-                error = np.linalg.norm(x.numpy() - expected) / np.linalg.norm(expected)
-                report.check(f"solver {name}, {precision}, error", error, limit)
-
-            report.attempt(f"solver {name}, {precision}", one)
-
-
-def check_ccd(report: Report, place: Device, count: int) -> None:
-    """Times of impact of random and hard queries against the CPU's in double precision, which the tests prove to be early."""
-    rng = np.random.default_rng(0)
-    families = (hard_queries.random, hard_queries.small_motions, hard_queries.flat_sheets, hard_queries.parallel_edges)
-    for kind in ("vertex_triangle", "edge_edge"):
-        points = np.concatenate([family(rng, count) for family in families]).astype(np.float32).astype(np.float64)
-        exact = pdipc.time_of_impact(points, kind, device="cpu")
-        for precision in ("float64", "float32"):
-            here = pdipc.time_of_impact(points, kind, precision=precision, device=place.name)
-            same = pdipc.time_of_impact(points, kind, precision=precision, device="cpu")
-            both = np.isfinite(here) & np.isfinite(same)
-            report.check(
-                f"CCD {kind}, {precision}, hit on one side only", np.mean(np.isfinite(here) != np.isfinite(same)), 1e-4
-            )
-            apart = np.abs(here[both] - same[both]).max(initial=0.0)
-            report.check(f"CCD {kind}, {precision}, times apart", apart, 1e-3)
-            # float32 may keep less of the gap than float64 does, but both keep some: a miss that the other stops late is a fault
-            missed = np.isinf(here) & (exact < 0.9)
-            report.check(f"CCD {kind}, {precision}, hits before 0.9 missed", np.count_nonzero(missed), 0)
-
-
-def check_steps(report: Report, place: Device, names: tuple[str, ...], steps: int) -> None:
-    """Bundled scenes: CUDA against the CPU, no intersection, the same bits again, recorded and launch by launch."""
-    for name in names:
-        for precision in SOLVER_TOLERANCE:
-            label = f"{name}, {precision}, {steps} steps:"
-            if report.left() < 15:
-                report.add(case=label, skipped="no time left")
-                continue
-            report.attempt(label, functools.partial(check_scene, report, place, name, precision, steps, label))
-
-
-def check_scene(report: Report, place: Device, name: str, precision: str, steps: int, label: str) -> None:
-    """One scene of check_steps in one precision."""
-    scene = pdipc.load_scene(name)
-    # the same solver on both sides, whatever is the default of each
-    tables = {"precision": precision, "linear_solver": "pcg"}
-    scene = scene.model_copy(update={"simulation": scene.simulation.model_copy(update=tables)})
-    model = pdipc.build(scene, "cpu")
-    there = _positions(scene, "cpu", steps, recorded=True)
-    here = _positions(scene, place.name, steps, recorded=True)
-    report.check(f"{label} CUDA against CPU / size", np.abs(here - there).max() / model.assembly.scene_size, STEP_TOLERANCE)
-    found = pdipc.find_intersections(here, model.triangles, model.assembly.obstacle)
-    report.check(f"{label} intersections", len(found), 0)
-    for recorded, told in ((True, "the second time"), (False, "unrecorded")):
-        again = _positions(scene, place.name, steps, recorded)
-        report.check(f"{label} bits that differ {told}", np.count_nonzero(here != again), 0)
-
-
-def _positions(scene: pdipc.Scene, device: str, steps: int, recorded: bool) -> np.ndarray:
-    model = pdipc.build(scene, device)
-    work, state = Work(model, recorded=recorded), model.initial_state()
-    for _ in range(steps):
-        state = step(model, state, work).state
-    return state.positions.numpy().astype(np.float64)
-
-
-# --- times ---
-
-
-def copy_bandwidth(place: Device, size: int) -> float:
-    """GB/s, read and written, of copying `size` bytes on the device."""
-    a, b = (wp.zeros(size // 4, dtype=wp.float32, device=place.warp) for _ in range(2))
-    return 2 * size / _seconds(place, lambda: wp.copy(b, a)) / 1e9
-
-
-def _seconds(place: Device, action: Callable[[], object], repeats: int = 9) -> float:
-    """Median of `repeats` runs after one that is not counted."""
-    times = []
-    for _ in range(repeats + 1):
-        wp.synchronize_device(place.warp)
-        begin = time.perf_counter()
-        action()
-        wp.synchronize_device(place.warp)
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times[1:])
-
-
-def time_solvers(report: Report, place: Device, sides: tuple[int, ...]) -> None:
-    """Fig. 8, and the bandwidth that a sweep of each solver reaches: bytes of the matrix and of the vectors that it must touch."""
-    precision = real("float32" if place.is_cuda else "float64")
-    copied = copy_bandwidth(place, 2**28 if place.is_cuda else 2**24)
-    report.add(**{"copy GB/s": copied})
-    print(f"  copy: {copied:.0f} GB/s")
-    for side in sides:
-        dof = 3 * side * side
-        if report.left() < 20 + 1.5e-4 * dof:  # setting up takes this long on the host
-            report.add(dof=dof, skipped="no time left")
-            continue
-        report.attempt(f"{dof} DOF, sweeps", functools.partial(_time_sweeps, report, place, precision, side, copied))
-        report.attempt(f"{dof} DOF, Fig. 8", functools.partial(_time_series, report, place, precision, side))
-
-
-def _time_series(report: Report, place: Device, precision: Real, side: int) -> None:
-    for dof, label, terms, relative, memory in fig8.measure(side, place, precision):
-        report.add(**{"dof": dof, "variant": label, "terms/s": terms, "relative to Jacobi": relative, "bytes": memory})
-        print(f"  {dof:9,} DOF  {label:34} {terms:12.0f} terms/s  {relative:5.2f} of Jacobi", flush=True)
-
-
-def _time_sweeps(report: Report, place: Device, precision: Real, side: int, copied: float) -> None:
-    system, mass, _ = table_cloth(side, place, precision)
-    b = loads(system, mass)["gravity"]
-    word = np.dtype(precision.numpy).itemsize
-    for name in ("chebyshev", "pcg"):
-        seconds = Run(system, b, name, {}).per_iteration()[1]
-        entries, vertices = system.rows.entries, system.count
-        # columns and values once; x, b, the last x and the new x; for PCG also the two vectors more that it keeps
-        touched = entries * (4 + word) + vertices * 3 * word * (4 if name == "chebyshev" else 8)
-        speed = touched / seconds / 1e9
-        us = 1e6 * seconds
-        report.add(**{"dof": 3 * vertices, "sweep of": name, "us": us, "GB/s": speed, "of copy": speed / copied})
-        told = f"{us:9.1f} us  {speed:7.1f} GB/s, {speed / copied:.2f} of a copy"
-        print(f"  {3 * vertices:9,} DOF  {name:34} {told}", flush=True)
-
-
-def time_ccd(report: Report, place: Device, count: int) -> None:
-    """Nanoseconds a query, with transfers."""
-    rng = np.random.default_rng(1)
-    for kind in ("vertex_triangle", "edge_edge"):
-        for label, family in (("near misses", hard_queries.small_motions), ("random", hard_queries.random)):
-            for precision in ("float32", "float64"):
-                points = family(rng, count).astype(precision)
-                query = functools.partial(pdipc.time_of_impact, points, kind, precision=precision, device=place.name)
-                ns = 1e9 * _seconds(place, query, 5) / count
-                row = {"kind": kind, "queries": label, "precision": precision, "ns a query, with transfers": ns}
-                report.add(**row)
-                print(f"  {kind:16} {label:12} {precision}  {ns:8.1f} ns a query, with transfers", flush=True)
-
-
-def time_scene(report: Report, place: Device, scene: pdipc.Scene, name: str, steps: int, seconds: float) -> None:
-    """Step times and stages; the witness looks at the last state."""
-    simulation = pdipc.Simulation(scene, place.name)
-    simulation.step()
-    simulation.reset()
-    results, times, begun = [], [], time.perf_counter()
-    while len(results) < steps and time.perf_counter() - begun < min(seconds, report.left() - 15):
-        start = time.perf_counter()
-        results.append(simulation.step())
-        times.append(1e3 * (time.perf_counter() - start))
-    if not results:
-        report.add(scene=name, skipped="no time left")
-        return
-    found = pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)
-    report.check(f"{name}: intersections after {len(results)} steps", len(found), 0)
-    stages = {key: statistics.fmean(r.milliseconds[key] for r in results) for key in results[0].milliseconds}
-    row = {
-        "scene": name,
-        "steps": len(results),
-        "asked": steps,
-        "median ms": statistics.median(times),
-        "mean ms": statistics.fmean(times),
-        "max ms": max(times),
-        "stages ms": stages,
-        "outer": statistics.fmean(r.outer for r in results),
-        "local_global": statistics.fmean(r.local_global for r in results),
-        "linear_iterations": statistics.fmean(r.linear_iterations for r in results),
-        "barriers": statistics.fmean(r.barriers for r in results),
-        "unconverged": sum(not r.converged for r in results),
-    }
-    report.add(**row)
-    told = " ".join(f"{key} {value:.2f}" for key, value in stages.items())
-    print(
-        f"  {name:26} {len(results):4} steps  median {row['median ms']:8.2f}  mean {row['mean ms']:8.2f} ms  [{told}]",
-        flush=True,
-    )
-
-
-def time_scenes(report: Report, place: Device, names: tuple[str, ...], steps: int) -> None:
-    """The scenes of benchmarks/simulation.py."""
-    from simulation import SCENES, H
-
-    for name in names:
-        scene = pdipc.Scene(simulation={"time_step": H, "steps": steps}, **SCENES[name]())
-        report.attempt(name, functools.partial(time_scene, report, place, scene, name, steps, 25.0))
-
-
-def time_armadillo(report: Report, place: Device, steps: int) -> None:
-    """Table 1's row; the paper has 43.1 ms a step and 19.4 to 112 FPS on an RTX 3090."""
-    path = _common.data("paper_armadillo/placed.npz")
-    if path is None:
-        report.add(scene="paper_armadillo", skipped="the optional data is not there")
-    else:
-        time_scene(report, place, authors_scene(path), "paper_armadillo", steps, 90.0)
-
-
-BENCHMARK_SCENES = ("block 10^3", "block 20^3", "squeezed block 10^3", "cloth 50x50", "cloth 100x100", "cloth 200x200")
-# Name, the most seconds it may take, and what it does: whole and with --small.
-PARTS: dict[str, tuple[float, Callable[[Report, Device], None], Callable[[Report, Device], None]]] = {
-    "solvers against a direct solution": (100, lambda r, d: check_solvers(r, d, 24), lambda r, d: check_solvers(r, d, 10)),
-    "CCD against the CPU": (60, lambda r, d: check_ccd(r, d, 100_000), lambda r, d: check_ccd(r, d, 200)),
-    "steps against the CPU": (
-        150,
-        lambda r, d: check_steps(r, d, CHECKED_SCENES, STEPS),
-        lambda r, d: check_steps(r, d, CHECKED_SCENES[:1], 2),
-    ),
-    "Table 1, Armadillo": (120, lambda r, d: time_armadillo(r, d, 200), lambda r, d: time_armadillo(r, d, 2)),
-    "benchmark scenes": (
-        180,
-        lambda r, d: time_scenes(r, d, BENCHMARK_SCENES, 100),
-        lambda r, d: time_scenes(r, d, BENCHMARK_SCENES[:1], 3),
-    ),
-    "solvers over sizes (Fig. 8)": (240, lambda r, d: time_solvers(r, d, SIDES), lambda r, d: time_solvers(r, d, (12,))),
-    "CCD": (40, lambda r, d: time_ccd(r, d, 1_000_000), lambda r, d: time_ccd(r, d, 1000)),
+PARTS = {
+    "scenes": Part(checks.check_scene, checks.scene_cases, 45, together=True),
+    "kernels": Part(checks.check_kernels, checks.precisions, 30, together=True),
+    "ccd": Part(checks.check_ccd, checks.precisions, 30, together=True),
+    "solvers": Part(checks.check_solver, checks.solver_cases, 30, together=True),
+    "peer scenes": Part(times.time_scene, times.peer_cases, 25),
+    "bundled scenes": Part(times.time_scene, times.bundled_cases, 15),
+    "ccd times": Part(times.time_ccd, times.ccd_cases, 20),
+    "sweeps": Part(times.time_sweeps, times.sweep_cases, 40),
+    "profile": Part(times.profile, times.profile_cases, 30),
 }
 
 
-def run_part(name: str, device: str, small: bool, seconds: float, path: Path) -> int:
-    """One part, in this process."""
-    report = Report(seconds, path)
-    PARTS[name][2 if small else 1](report, Device(device))
-    report._keep()
-    return 0
+def run_cases(part: str, cases: list[str], options: argparse.Namespace, out: Path) -> None:
+    """Cases of a part, in this process, which ends with all its tracebacks where one takes too long."""
+    place, end, most = Device(options.device), time.perf_counter() + options.seconds, options.limit or np.inf
+    for case in cases:
+        limit = min(PARTS[part].seconds, most, end - time.perf_counter())
+        report = Report(out, part, case, limit)
+        if limit < 3:
+            report.add(skipped="no time left")
+            continue
+        report.add(begun=True)
+        faulthandler.dump_traceback_later(limit + GRACE, exit=True)
+        try:
+            PARTS[part].run(report, place, case, options.carried)
+            wp.synchronize()
+        except Exception as error:
+            traceback.print_exc()
+            report.add(broken=f"{type(error).__name__}: {error}")
+            sys.stdout.flush()
+            os._exit(1)  # after some errors of CUDA nothing works any more in a process, not even its end
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+        report.add(ended=True, seconds=limit - report.left())
 
 
-def start_part(name: str, device: str, small: bool, seconds: float, path: Path) -> dict:
-    """One part in a process of its own, which is ended when its time is over; what it found up to its end."""
-    command = [sys.executable, __file__, "--part", name, "--device", device, "--seconds", str(seconds), "-o", str(path)]
-    error = None
-    try:
-        code = subprocess.run([*command, *(["--small"] if small else [])], timeout=seconds + 10).returncode
-        error = f"its process ended with code {code}" if code else None
-    except subprocess.TimeoutExpired:
-        error = f"it did not end within {seconds + 10:.0f} s"
-    found = json.loads(path.read_text()) if path.exists() else {"checks": [], "rows": []}
-    if error:
-        print(f"  BROKEN {name}: {error}", flush=True)
-        found["broken"] = error
-    return found
+def start_cases(part: str, cases: list[str], options: argparse.Namespace, seconds: float) -> str:
+    """Cases of a part in processes of their own; what they print. A process that ends early is followed by one for the cases after."""
+    printed, end = "", time.perf_counter() + seconds
+    while cases and end - time.perf_counter() > 3:
+        left = end - time.perf_counter()
+        command = [
+            sys.executable,
+            "-X",
+            "faulthandler",
+            __file__,
+            "--part",
+            part,
+            "--cases",
+            json.dumps(cases),
+            "--device",
+            options.device,
+        ]
+        command += ["--seconds", str(left), "-o", str(options.output)]
+        command += ["--carried", str(options.carried)] if options.carried else []
+        command += ["--limit", str(options.limit)] if options.limit else []
+        try:
+            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=left + START)
+            printed, error = printed + done.stdout, f"its process ended with code {done.returncode}"
+        except subprocess.TimeoutExpired as late:
+            out = late.stdout or b""
+            printed, error = printed + (out.decode() if isinstance(out, bytes) else out), "its process did not end in time"
+        lines = [line for line in read(options.output / "gpu.jsonl") if line["part"] == part]
+        over = {line["case"] for line in lines if "ended" in line or "broken" in line or "skipped" in line}
+        begun = {line["case"] for line in lines if "begun" in line}
+        rest = [case for case in cases if case not in over]
+        if not rest:
+            return printed
+        stuck = [case for case in rest if case in begun] or (rest[:1] if len(rest) == len(cases) else [])
+        for case in stuck:
+            Report(options.output / "gpu.jsonl", part, case, 0.0).add(broken=error)
+            printed += f"  BROKEN {case}: {error}\n"
+        cases = [case for case in rest if case not in stuck]
+    for case in cases:
+        Report(options.output / "gpu.jsonl", part, case, 0.0).add(skipped="no time left")
+    return printed
+
+
+def read(path: Path) -> list[dict]:
+    """The lines so far."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def sound(lines: list[dict]) -> bool:
+    """Whether every check passed and nothing broke."""
+    return not any("broken" in line or line.get("passed") is False for line in lines)
 
 
 def describe(place: Device) -> dict:
-    """The machine and what ran on it."""
-    found = {"device": place.warp.name, "host": platform.platform(), "warp": wp.config.version, "numpy": np.__version__}
-    found["date"] = datetime.date.today().isoformat()
+    """The machine and what runs on it."""
+    found = {"device": place.warp.name, "host": platform.platform(), "python": platform.python_version()}
+    found |= {
+        "warp": wp.config.version,
+        "numpy": np.__version__,
+        "date": datetime.date.today().isoformat(),
+        "cores": os.cpu_count(),
+    }
     if place.is_cuda:
-        query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+        query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.sm,clocks.max.sm", "--format=csv,noheader"]
         try:
             found["nvidia-smi"] = subprocess.run(query, capture_output=True, text=True, check=True).stdout.strip()
         except (OSError, subprocess.CalledProcessError) as error:
@@ -372,44 +189,66 @@ def describe(place: Device) -> dict:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", help='absent: the first CUDA device; "cpu" only tries the command')
-    parser.add_argument("--small", action="store_true", help="few and small cases, within a minute")
-    parser.add_argument("-o", "--output", type=Path, help="absent: benchmarks/results/gpu-<machine>.json")
+    parser.add_argument("--small", action="store_true", help="few and small cases")
+    parser.add_argument("-o", "--output", type=Path, default=REPOSITORY / "results" / "gpu", help="absent: results/gpu")
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some parts: {', '.join(PARTS)}")
-    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--case", default="", help="only the cases whose name contains this")
     parser.add_argument("--seconds", type=float, default=BUDGET, help=f"absent: {BUDGET}")
+    parser.add_argument("--limit", type=float, help="most seconds a case; absent: as each part says")
+    parser.add_argument(
+        "--jobs", type=int, default=min(6, max(1, (os.cpu_count() or 1) // 2)), help="processes of checks at once"
+    )
+    parser.add_argument("--carried", type=Path, help="what --prepare wrote")
+    parser.add_argument("--prepare", type=Path, help="a folder for references of the CPU and, with --arch, compiled kernels")
+    parser.add_argument(
+        "--arch", type=int, help="90 for an H100; the kernels' cache is then FOLDER/kernels, for WARP_CACHE_PATH"
+    )
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--cases", type=json.loads, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
+    if options.prepare:
+        checks.prepare(options.prepare, options.arch, options.small, options.case)
+        return 0
     wp.init()
     if options.device is None and not wp.is_cuda_available():
         print("no CUDA device was found; to try this command without one: --device cpu --small", file=sys.stderr)
         return 2
-    device = options.device or "cuda:0"
+    options.device = options.device or "cuda:0"
+    options.output.mkdir(parents=True, exist_ok=True)
+    lines = options.output / "gpu.jsonl"
     if options.part:
-        return run_part(options.part, device, options.small, options.seconds, options.output)
-    begun, place = time.perf_counter(), Device(device)
-    machine = describe(place)
+        run_cases(options.part, options.cases, options, lines)
+        return 0
+    begun = time.perf_counter()
+    machine = describe(Device(options.device))
     print(", ".join(str(value) for value in machine.values()), flush=True)
-    slug = re.sub(r"[^a-z0-9]+", "-", place.warp.name.lower()).strip("-")
-    out = options.output or REPOSITORY / "benchmarks" / "results" / f"gpu-{slug}.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    parts: dict[str, dict] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for number, name in enumerate(options.only or PARTS):
-            left = options.seconds - (time.perf_counter() - begun)
-            print(f"{name}  [{left:.0f} s left]", flush=True)
-            if left < 30:
-                parts[name] = {"checks": [], "rows": [], "skipped": f"{left:.0f} s were left of {options.seconds:.0f}"}
-            else:
-                seconds = min(PARTS[name][0], left - 15)
-                parts[name] = start_part(name, device, options.small, seconds, Path(folder) / f"{number}.json")
-            seconds = time.perf_counter() - begun
-            found = {"machine": machine, "small": options.small, "seconds": seconds, "ok": sound(parts), "parts": parts}
-            out.write_text(json.dumps(found, indent=1))
-    checks = [check for part in parts.values() for check in part["checks"]]
-    failed = sum(not check["passed"] for check in checks)
-    broken = [name for name, part in parts.items() if "broken" in part or any("broken" in row for row in part["rows"])]
-    told = f"; broken: {', '.join(broken)}" if broken else ""
-    print(f"{len(checks)} checks, {failed} failed{told}; {time.perf_counter() - begun:.0f} s; {out}")
-    return 0 if sound(parts) else 1
+    lines.unlink(missing_ok=True)
+    for name in options.only or PARTS:
+        part, left = PARTS[name], options.seconds - (time.perf_counter() - begun)
+        cases = [case for case in part.cases(options.small) if options.case in case]
+        jobs = min(options.jobs, len(cases)) if part.together else 1
+        print(f"{name}: {len(cases)} cases  [{left:.0f} s left]", flush=True)
+        with ThreadPoolExecutor(max(1, jobs)) as pool:
+            shares = [cases[job::jobs] for job in range(jobs)]
+            for printed in pool.map(
+                lambda share, name=name, left=left: start_cases(name, share, options, left - START), shares
+            ):
+                print(printed, end="", flush=True)
+        found = read(lines)
+        told = {"machine": machine, "small": options.small, "seconds": time.perf_counter() - begun, "ok": sound(found)}
+        results = [line for line in found if "begun" not in line]
+        text = ",\n".join(json.dumps(line) for line in results)
+        (options.output / "gpu.json").write_text(json.dumps(told, indent=1)[:-2] + f',\n "results": [\n{text}\n]}}\n')
+    failed = [line for line in found if line.get("passed") is False]
+    broken = [line for line in found if "broken" in line]
+    skipped = [line for line in found if "skipped" in line]
+    for line in [*broken, *failed]:
+        print("  ", json.dumps(line))
+    count = sum("check" in line for line in found)
+    print(
+        f"{count} checks, {len(failed)} failed, {len(broken)} broken, {len(skipped)} skipped; {time.perf_counter() - begun:.0f} s"
+    )
+    return 0 if sound(found) else 1
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 from typer.testing import CliRunner
 
-from pdipc.cli.commands import app
+from pdipc.cli import app
 
 matplotlib.use("Agg")
 

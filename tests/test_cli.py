@@ -1,18 +1,21 @@
 """The command line: exit codes, messages on the right stream, and what its commands write."""
 
 import contextlib
+import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pdipc.cli.commands import app, metres
+from pdipc.cli import app, metres
 from pdipc.output.results import RunWriter, open_run
 from tests.output import runs
 
@@ -35,7 +38,7 @@ def scene(tmp_path):
 @pytest.fixture
 def fake(monkeypatch):
     """Puts a simulation in place of the true one that writes what `runs` makes, and records how it was called."""
-    calls = types.SimpleNamespace(interrupt_after=None, given={})
+    calls = types.SimpleNamespace(interrupt_after=None, interrupt_with=signal.SIGINT, given={})
 
     def run_scene(scene, out_dir, *, steps, device, resume, overwrite, certify, progress):
         calls.given = {"scene": scene, "steps": steps, "device": device, "resume": resume, "certify": certify}
@@ -47,12 +50,13 @@ def fake(monkeypatch):
             writer, state = runs.begin(out_dir, overwrite=overwrite, as_json=scene.model_dump_json())
             done = 0
         total = scene.simulation.steps if steps is None else steps
-        for step in range(done + 1, total + 1):
-            state = runs.advance(writer, state, range(step, step + 1))
-            if step == calls.interrupt_after:
-                os.kill(os.getpid(), signal.SIGINT)
-            result = types.SimpleNamespace(outer=3, barriers=7, smallest_gap=float("inf"))
-            progress(types.SimpleNamespace(step=step, steps=total, result=result))
+        with writer:
+            for step in range(done + 1, total + 1):
+                state = runs.advance(writer, state, range(step, step + 1))
+                if step == calls.interrupt_after:
+                    os.kill(os.getpid(), calls.interrupt_with)
+                result = types.SimpleNamespace(outer=3, barriers=7, smallest_gap=float("inf"))
+                progress(types.SimpleNamespace(step=step, steps=total, result=result))
 
     monkeypatch.setitem(sys.modules, "pdipc.simulation", types.SimpleNamespace(run_scene=run_scene))
     return calls
@@ -80,13 +84,13 @@ def test_bundled_scenes_are_listed():
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["run", "nothing"], 1, "no such file"),
+        (["run", "nothing"], 2, "no such file"),
         (["run"], 2, "SCENE"),
         (["run", "squeeze", "--steps", "-1"], 2, "steps"),
         (["run", "squeeze", "--solver", "magic"], 2, "--solver"),
         (["run", "squeeze", "--resume", "--overwrite"], 2, "exclude each other"),
-        (["run", "squeeze", "-o", "nowhere", "--resume"], 1, "does not exist"),
-        (["check", "nowhere"], 1, "nowhere does not exist"),
+        (["run", "squeeze", "-o", "nowhere", "--resume"], 2, "does not exist"),
+        (["check", "nowhere"], 2, "nowhere does not exist"),
         (["render", "nowhere", "-o", "a.png", "--size", "big"], 2, "--size"),
         (["render", "nowhere", "-o", "a.png", "--size", "9000x100"], 2, "--size"),
         (["render", "nowhere", "-o", "a.png", "--view", "up"], 2, "--view"),
@@ -118,22 +122,22 @@ def test_run_passes_options_and_reports(fake, scene, tmp_path):
     assert open_run(out).frame_count == 5
 
     again = runner.invoke(app, ["run", str(scene), "-o", str(out)])
-    assert (again.exit_code, "--overwrite" in again.stderr) == (1, True)
+    assert (again.exit_code, "--overwrite" in again.stderr) == (2, True)
     assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--overwrite", "--steps", "1"]).exit_code == 0
     assert open_run(out).frame_count == 2
 
 
-def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_runs_go_on_where_they_stopped(fake, scene, tmp_path, number, code):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert runner.invoke(app, ["run", str(scene), "-o", str(whole)]).exit_code == 0
-    fake.interrupt_after = 3
+    fake.interrupt_after, fake.interrupt_with = 3, number
     result = runner.invoke(app, ["run", str(scene), "-o", str(cut)])
-    assert result.exit_code == 130
+    assert result.exit_code == code
     assert "stopped after step 3 of 8" in result.stderr
     assert f"pdipc run {scene} -o {cut} --resume" in result.stderr
     fake.interrupt_after = None
     assert runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume"]).exit_code == 0
-    assert fake.given["device"] == "cpu"
     again = runner.invoke(app, ["run", str(scene), "-o", str(cut), "--resume", "--steps", "5"])
     assert (again.exit_code, "has 8 steps already; nothing was added" in again.stdout) == (0, True)
     for i in range(9):
@@ -165,17 +169,6 @@ def test_an_interrupt_that_a_library_loses_ends_the_run_after_a_step(fake, scene
     monkeypatch.setattr(sys.modules["pdipc.simulation"], "run_scene", run_scene)
     result = runner.invoke(app, ["run", str(scene), "-o", str(tmp_path / "out")])
     assert (result.exit_code, "stopped after step 1 of 8" in result.stderr) == (130, True)
-
-
-def test_resuming_with_another_scene_or_device_is_refused(fake, scene, tmp_path):
-    out = tmp_path / "out"
-    assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--steps", "2"]).exit_code == 0
-    other = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--solver", "direct"])
-    assert (other.exit_code, "simulation.linear_solver differs" in other.stderr) == (1, True)
-    device = runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--device", "cuda:0"])
-    assert (device.exit_code, "was run on cpu" in device.stderr) == (1, True)
-    assert runner.invoke(app, ["run", str(scene), "-o", str(out), "--resume", "--steps", "5"]).exit_code == 0
-    assert open_run(out).frame_count == 6
 
 
 def test_check_finds_what_intersects(folder):
@@ -221,15 +214,140 @@ def test_check_scene_lists_everything(scene):
 def test_info_describes_runs_and_scenes(folder, scene):
     told = runner.invoke(app, ["info", str(folder)])
     assert told.exit_code == 0, told.stderr
-    assert "4 frames, 0.03 s" in told.stdout
+    assert "4 frames, 0.03 s; 3 of 8 steps done" in told.stdout
     assert "cloth" in runner.invoke(app, ["info", str(scene)]).stdout
     assert runner.invoke(app, ["info", "twisted_cloth"]).exit_code == 0
+
+
+def test_info_tells_convergence_time_and_machine(folder):
+    lines = [json.loads(line) for line in (folder / "stats.jsonl").read_text().splitlines()]
+    for line, converged, residual in zip(lines[1:], (True, False, True), (1e-6, 3e-3, 2e-6), strict=True):
+        line |= {"converged": converged, "residual": residual, "barriers": 12, "milliseconds": {"ccd": 1.5, "solver": 2.5}}
+    (folder / "stats.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    told = runner.invoke(app, ["info", str(folder)]).stdout
+    assert "66.67 % of the steps converged (1 did not), worst residual 3 mm" in told
+    assert "0.012 s of work, median 4 ms a step" in told
+    assert "smallest gap 1 mm, at most 12 contacts" in told
+    assert "made on cpu, float32, Linux" in told or sys.platform != "linux"
+    assert f"python {sys.version.split()[0]}" in told
 
 
 def test_export_writes_beside_the_run(folder):
     result = runner.invoke(app, ["export", str(folder), "--format", "obj"])
     assert result.exit_code == 0, result.stderr
     assert len(list((folder.parent / "run_obj").glob("*.obj"))) == 4
+
+
+def test_export_of_some_bodies_and_frames(folder, tmp_path):
+    out = tmp_path / "some"
+    options = ["--bodies", "floor", "--bodies", "cloth", "--every", "2", "-o", str(out)]
+    result = runner.invoke(app, ["export", str(folder), "--format", "obj", *options])
+    assert result.exit_code == 0, result.stderr
+    assert len(list(out.glob("*.obj"))) == 2
+    names = [line[2:] for line in (out / "frame_000001.obj").read_text().splitlines() if line.startswith("o ")]
+    assert names == ["cloth", "floor"]
+    wrong = runner.invoke(app, ["export", str(folder), "--format", "obj", "--bodies", "sail"])
+    assert (wrong.exit_code, 'has no body "sail"; it has: ball, cloth, floor' in wrong.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["export", "--format", "obj", "-o", "in/it"],
+        ["export", "--format", "usd", "-o", "run.usdc"],
+        ["render", "-o", "picture.png"],
+        ["audit", "-o", "plot.png"],
+        ["audit", "--csv", "table.csv"],
+        ["audit", "--forces", "forces.npz"],
+    ],
+)
+def test_nothing_is_written_into_a_run_folder(folder, arguments):
+    before = sorted(folder.rglob("*"))
+    *options, name = arguments[1:]
+    result = runner.invoke(app, [arguments[0], str(folder), *options, str(folder / name)])
+    assert (result.exit_code, "holds nothing but its run" in " ".join(result.stderr.split())) == (2, True), result.stderr
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_audit_writes_tables_and_forces_with_names(tmp_path):
+    folder = tmp_path / "run"
+    runs.write(folder, steps=3, precision="float64")
+    result = runner.invoke(
+        app, ["audit", str(folder), "--csv", str(tmp_path / "a.csv"), "--forces", str(tmp_path / "f.npz"), "--every", "2"]
+    )
+    assert result.exit_code == 0, result.stderr
+    with open(tmp_path / "a.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step"] for row in rows] == ["0", "2"]
+    assert float(rows[0]["total [J]"]) == pytest.approx(sum(float(rows[0][f"{n} [J]"]) for n in ENERGIES), rel=1e-12)
+    assert {f"Fy on {name} [N]" for name in ("ball", "cloth", "floor")} < set(rows[0])
+    printed = result.stdout.splitlines()[2].split()
+    assert printed[1:6] == [f"{float(rows[0][f'{n} [J]']):.4g}" for n in (*ENERGIES, "total")]
+    with np.load(tmp_path / "f.npz") as forces:
+        assert forces["body_names"].tolist() == ["ball", "cloth", "floor"]
+        assert forces["force"].shape == (2, len(forces["body_of_vertex"]), 3)
+
+
+ENERGIES = ("kinetic", "elastic", "barrier", "gravity")
+
+
+def test_a_new_scene_runs_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = runner.invoke(app, ["new", "mine.toml"])
+    assert made.exit_code == 0, made.stderr
+    assert runner.invoke(app, ["check-scene", "mine.toml"]).exit_code == 0
+    uncommented = re.sub(
+        r"(?m)^# ((\[\[|\w+ = ).*)$", r"\1", Path("mine.toml").read_text()
+    )  # what it proposes is right as well
+    assert uncommented != Path("mine.toml").read_text()
+    Path("all.toml").write_text(uncommented)
+    assert runner.invoke(app, ["check-scene", "all.toml"]).stdout == "all.toml: can be simulated\n"
+    again = runner.invoke(app, ["new", "mine.toml"])
+    assert (again.exit_code, "exists already" in again.stderr) == (1, True)
+    assert runner.invoke(app, ["new", "mine.json"]).exit_code == 2
+
+
+def test_the_schema_is_that_of_scenes(tmp_path):
+    printed = json.loads(runner.invoke(app, ["schema"]).stdout)
+    assert {"simulation", "bodies", "obstacles"} < set(printed["properties"])
+    out = runner.invoke(app, ["schema", "-o", str(tmp_path / "s.json")])
+    assert "#:schema" in out.stdout
+    assert json.loads((tmp_path / "s.json").read_text()) == printed
+
+
+def test_figures_are_listed():
+    listed = runner.invoke(app, ["reproduce", "--list"])
+    assert listed.exit_code == 0, listed.stderr
+    told = dict(line.split(maxsplit=1) for line in listed.stdout.splitlines())
+    assert {"fig2", "fig12", "armadillo"} < set(told)
+    assert list(told).index("fig2") < list(told).index("fig12")
+
+
+def test_the_shell_completes_names(monkeypatch):
+    monkeypatch.setenv("_PDIPC_COMPLETE", "complete_bash")
+    for words, expected in (
+        ("pdipc run twi", "twisted_cloth"),
+        ("pdipc che", "check-scene"),
+        ("pdipc reproduce fig1", "fig12"),
+    ):
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+        assert expected in runner.invoke(app, [], prog_name="pdipc").stdout.split()
+
+
+def test_the_first_run_tells_that_kernels_are_compiled(capsys):
+    import warp as wp
+
+    from pdipc.cli.running import _told_of_compiling
+
+    told, level = [], wp.config.log_level
+    with _told_of_compiling(told.append):
+        for what in (" (cached)", " (compiled)"):
+            with wp.ScopedTimer("Module x load on device 'cpu'") as timer:  # as Warp loads a module
+                timer.extra_msg = what
+    assert told == [1]
+    assert wp.config.log_level == level
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(

@@ -12,42 +12,61 @@ COMMAND = [sys.executable, str(Path(__file__).parents[1] / "benchmarks" / "gpu.p
 
 
 def test_the_command_on_the_cpu(tmp_path):
-    out = tmp_path / "gpu.json"
-    done = subprocess.run([*COMMAND, "--device", "cpu", "--small", "-o", out], capture_output=True, text=True)
+    """References and kernels prepared beforehand, then every part on small cases."""
+    carried = ["--case", "box_stack float64", "--small"]
+    done = subprocess.run([*COMMAND, "--prepare", tmp_path, *carried], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(out.read_text())
+    command = [*COMMAND, "--device", "cpu", "--small", "--jobs", "1", "-o", tmp_path, "--carried", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "gpu.json").read_text())
     assert found["ok"]
-    parts = found["parts"]
-    checks = [check for part in parts.values() for check in part["checks"]]
-    assert len(checks) > 35
+    results = found["results"]
+    assert results == [line for line in map(json.loads, (tmp_path / "gpu.jsonl").open()) if "begun" not in line]
+    checks = [line for line in results if "check" in line]
+    assert len(checks) > 60
     assert all(check["passed"] and check["found"] <= check["limit"] for check in checks)
-    assert len(parts) == 7
-    rows = parts["solvers over sizes (Fig. 8)"]["rows"]
-    assert {row["variant"] for row in rows if "variant" in row} >= {"order 1 (Jacobi)", "order 2", "order 3"}
-    assert all(row["of copy"] > 0.0 for row in rows if "of copy" in row)
-    assert parts["benchmark scenes"]["rows"][0]["steps"] == 3
+    parts = {line["part"] for line in results if "ended" in line}
+    assert {"scenes", "kernels", "ccd", "solvers", "peer scenes", "bundled scenes", "ccd times", "sweeps"} <= parts
+    variants = {line["variant"] for line in results if "variant" in line}
+    assert variants >= {"order 1 (Jacobi)", "order 2", "order 3"}
+    assert next(line for line in results if line["case"] == "s2_2" and "steps" in line)["steps"] > 0
 
 
 def test_what_breaks_costs_nothing_else(tmp_path, monkeypatch):
-    """A case that raises leaves the others their turn; a part that hangs is ended, keeps what it had, and fails the run."""
+    """A case that raises, one that ends its process and one that hangs leave the others their turn; the run fails and says why."""
     monkeypatch.syspath_prepend(str(Path(COMMAND[1]).parent))
     import gpu
 
-    report = gpu.Report(10.0, tmp_path / "part.json")
-    report.attempt("first", lambda: 1 / 0)
-    report.attempt("second", lambda: report.add(speed=2.0))
+    report = gpu.Report(tmp_path / "gpu.jsonl", "part", "case", 10.0)
     report.check("small", float("nan"), 1.0)
-    kept = json.loads((tmp_path / "part.json").read_text())
-    assert kept["rows"] == [{"case": "first", "broken": "ZeroDivisionError: division by zero"}, {"speed": 2.0}]
-    assert not kept["checks"][0]["passed"]
-    fine = {"checks": [], "rows": [{"speed": 2.0}]}
-    assert gpu.sound({"fine": fine})
-    assert not gpu.sound({"fine": fine, "kept": kept | {"checks": []}})
-    assert not gpu.sound({"fine": fine, "kept": kept | {"rows": []}})
-    ended = gpu.start_part("CCD", "cpu", True, -9.9, tmp_path / "part.json")
-    assert "did not end within" in ended["broken"]
-    assert ended["rows"] == kept["rows"]
-    assert not gpu.sound({"ended": ended})
+    assert not gpu.sound(gpu.read(report.path))
+    broken = tmp_path / "broken.py"
+    broken.write_text(
+        f"""
+import os, sys, time
+from pathlib import Path
+sys.path.insert(0, {str(Path(COMMAND[1]).parent)!r})
+import gpu
+def run(report, place, case, carried):
+    if case == "raises": raise ValueError("told")
+    if case == "ends": os._exit(3)
+    if case == "hangs": time.sleep(60)
+    report.add(speed=2.0)
+gpu.PARTS = {{"part": gpu.Part(run, lambda small: ["raises", "first", "ends", "hangs", "last"], 4.0)}}
+gpu.GRACE = 0.5
+gpu.__file__ = __file__
+sys.exit(gpu.main())
+"""
+    )
+    command = [sys.executable, broken, "--device", "cpu", "-o", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "ValueError: told" in done.stdout
+    assert "time.sleep(60)" in done.stdout or "in run" in done.stdout  # where it hung
+    results = json.loads((tmp_path / "gpu.json").read_text())["results"]
+    assert [line["case"] for line in results if "speed" in line] == ["first", "last"]
+    assert [line["case"] for line in results if "broken" in line] == ["raises", "ends", "hangs"]
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="there is a GPU, on which this would run for minutes")

@@ -1,5 +1,5 @@
 """`python -m pdipc`."""
 
-from pdipc.cli.commands import app
+from pdipc.cli import app
 
 app()

@@ -62,6 +62,7 @@ class State:
     time: float = 0.0
     step: int = 0
 
+    @one_at_a_time
     def copy(self) -> "State":
         """An independent copy."""
         return replace(
@@ -75,6 +76,7 @@ class State:
     def __deepcopy__(self, memo: dict) -> "State":
         return self.copy()
 
+    @one_at_a_time
     def arrays(self) -> dict[str, Any]:
         """The state as NumPy arrays, bit for bit: what a checkpoint holds."""
         return {
@@ -115,7 +117,7 @@ class Model:
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
     solver: of the local-global method, else None. free_vertices: (n,) bool; held: (n,) kg/s^2, what a common motion of all costs each:
-    mass over h^2, damping, attachments to points. rigid: vertex ranges of the moving obstacles. triangles: (m, 3) int32, all surfaces.
+    mass over h^2, damping, attachments to points. rigid: vertex ranges of the obstacles that move without deforming. triangles: (m, 3) int32, all surfaces.
     """
 
     scene: Scene
@@ -168,6 +170,7 @@ class Model:
         zero = np.zeros_like(a.positions)
         return self.state_from({"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "time": 0.0})
 
+    @one_at_a_time
     def state_from(self, arrays: dict[str, Any]) -> State:
         """A state from NumPy arrays such as `State.arrays()` gives."""
 
@@ -292,7 +295,9 @@ def build(scene: Scene, device: str | None = None) -> Model:
         surface=skin,
         broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
-        rigid=[(b.first, b.last) for b in assembly.bodies if b.trajectory is not None and not b.trajectory.is_static],
+        rigid=[
+            (b.first, b.last) for b in assembly.bodies if b.trajectory and b.trajectory.is_rigid and not b.trajectory.is_static
+        ],
         triangles=assembly.triangles,
     )
 

@@ -1,10 +1,12 @@
 """Running a scene: in memory (`Simulation`, `simulate`) or into a folder that survives a kill (`run_scene`)."""
 
+import dataclasses
+import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -13,6 +15,9 @@ from pdipc.device.launch import one_at_a_time
 from pdipc.drive import StepResult, Work, step
 from pdipc.model import Model, State, build
 from pdipc.scene.schema import Scene
+
+if TYPE_CHECKING:
+    from pdipc.output.results import RunWriter
 
 CHECKPOINT_SECONDS = 10.0  # a checkpoint is written when the last one is older
 
@@ -50,6 +55,7 @@ class Simulation:
         self.observe = observe
 
     @property
+    @one_at_a_time
     def positions(self) -> np.ndarray:
         """(n, 3) float64, m."""
         return self.state.positions.numpy().astype(np.float64)
@@ -84,13 +90,13 @@ class Simulation:
             raise ValueError(f"the force on vertex {vertices[wrong[0]]} is {forces[wrong[0]].tolist()}; it must be finite")
         self.model.external.pulled = (vertices, forces)
 
+    @one_at_a_time
     def step(self) -> StepResult:
         """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them."""
-        results = []
-        for _ in range(self.model.substeps):
-            result = step(self.model, self.state, self.work, self.observe, into=self.state)
-            results.append(result)
-        return _merge(results)
+        self.model.device.refuse_forked()
+        return _merge(
+            [step(self.model, self.state, self.work, self.observe, into=self.state) for _ in range(self.model.substeps)]
+        )
 
     @one_at_a_time
     def reset(self) -> None:
@@ -102,19 +108,33 @@ class Simulation:
 
 
 def _merge(results: list[StepResult]) -> StepResult:
-    if len(results) == 1:
-        return results[0]
-    last = results[-1]
-    total = StepResult(**{**last.__dict__})
-    for name in ("local_global", "outer", "linear_iterations", "truncations"):
-        setattr(total, name, sum(getattr(result, name) for result in results))
-    total.barriers = max(result.barriers for result in results)
-    total.converged = all(result.converged for result in results)
-    total.residual = max(result.residual for result in results)
-    total.smallest_gap = min(result.smallest_gap for result in results)
-    total.message = "; ".join(dict.fromkeys(result.message for result in results if result.message))
-    total.milliseconds = {key: sum(result.milliseconds[key] for result in results) for key in last.milliseconds}
-    return total
+    """Of a step's sub-steps: counts and times add up, lengths are the worst, the rest is that of the last."""
+    merged = {
+        field.name: _merged(field.name, [getattr(r, field.name) for r in results]) for field in dataclasses.fields(StepResult)
+    }
+    return StepResult(**merged)
+
+
+def _merged(name: str, values: list[Any]) -> Any:
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    last = known[-1]
+    if name in ("constraints", "barriers"):
+        return max(known)
+    if name == "smallest_gap":
+        return min(known)
+    if isinstance(last, bool):
+        return all(known)
+    if isinstance(last, int):
+        return sum(known)
+    if isinstance(last, float):
+        return max(known)
+    if isinstance(last, str):
+        return "; ".join(dict.fromkeys(filter(None, known)))
+    if isinstance(last, dict):
+        return {key: sum(value[key] for value in known) for key in last}
+    return last
 
 
 def simulate(scene: Scene | Model, steps: int | None = None, device: str | None = None) -> Iterator[Frame]:
@@ -126,11 +146,9 @@ def simulate(scene: Scene | Model, steps: int | None = None, device: str | None 
 
 
 def stats_of(result: StepResult) -> dict[str, Any]:
-    """A step's statistics as plain values, named after the columns of the paper's Table 1."""
-    record = {name: value for name, value in result.__dict__.items() if name != "state"}
-    if not np.isfinite(record["smallest_gap"]):
-        record["smallest_gap"] = None
-    return record
+    """A step's statistics as plain values, named after the columns of the paper's Table 1; None for what is not finite."""
+    record = {field.name: getattr(result, field.name) for field in dataclasses.fields(result) if field.name != "state"}
+    return {name: None if isinstance(value, float) and not np.isfinite(value) else value for name, value in record.items()}
 
 
 def run_scene(
@@ -144,50 +162,93 @@ def run_scene(
     certify: bool = False,
     progress: Callable[[StepInfo], None] | None = None,
 ) -> None:
-    """Simulates `scene` into the folder `out_dir`: frames, statistics, checkpoints.
+    """Simulates `scene` into the folder `out_dir`: frames, statistics, checkpoints. The folder is locked meanwhile.
 
-    A run that was stopped goes on with `resume=True`, from its last checkpoint, and gives the same bits as one that was not.
-    certify: also record every committed motion, for `pdipc certify`. progress: called after each step.
-    Raises SceneError for a scene that cannot be simulated, before anything is launched.
+    A run that was stopped, at any moment and by whatever, goes on with `resume=True` from its last checkpoint, and gives the same bits
+    as one that was not. certify: also record every committed motion, for `pdipc certify`. progress: called after each step.
+
+    Raises SceneError for a scene that cannot be simulated, before anything is launched; RunError where the folder does not take this
+    run, is being written by another process, or has no room.
     """
-    from pdipc.output.results import RunWriter
+    from pdipc.output.results import RunError, RunWriter, open_run
 
+    if resume:
+        begun = open_run(out_dir)
+        if where := _first_difference(*(_without_steps(each) for each in (Scene.model_validate(begun.scene), scene))):
+            raise RunError(
+                f"{out_dir} holds a run of another scene ({where} differs); resume it with its own scene and options"
+            )
+        device = device or begun.meta.get("device")
     simulation = Simulation(scene, device)
     model = simulation.model
     steps = model.scene.simulation.steps if steps is None else steps
+    made_by = {"device": model.device.name, "precision": model.real.name}
     if resume:
+        for name, now in made_by.items():
+            if begun.meta.get(name, now) != now:
+                raise RunError(
+                    f"{out_dir} was run on {begun.meta[name]}; going on with {name} {now} would not give the same results"
+                )
         writer = RunWriter.resume(out_dir)
-        checkpoint = writer.latest_checkpoint()
-        if checkpoint is not None:
-            simulation.state = model.state_from(checkpoint[1])
     else:
         topology = {"triangles": model.triangles, **model.assembly.topology()}
-        meta = {"device": model.device.name, "precision": model.real.name, "threads": model.device.threads}
-        meta |= {"solver_dropped": model.solver.dropped}
+        meta = {**made_by, "threads": model.device.threads, "solver_dropped": model.solver.dropped}
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
+    with writer:
+        _run(simulation, writer, steps, certify, progress)
+
+
+def _without_steps(scene: Scene) -> dict[str, Any]:
+    data = json.loads(scene.model_dump_json())
+    del data["simulation"]["steps"]
+    return data
+
+
+def _first_difference(a: Any, b: Any, path: str = "") -> str | None:
+    """The key of the first value that differs, such as "bodies[0].material.density"; None where all are the same."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        inner = ((f"{path}.{name}" if path else name, a.get(name), b.get(name)) for name in sorted({*a, *b}))
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        inner = ((f"{path}[{i}]", *both) for i, both in enumerate(zip(a, b, strict=True)))
+    else:
+        return None if a == b else path
+    return next(filter(None, (_first_difference(*values, where) for where, *values in inner)), None)
+
+
+def _run(
+    simulation: Simulation, writer: "RunWriter", steps: int, certify: bool, progress: Callable[[StepInfo], None] | None
+) -> None:
+    """From the last checkpoint, or the start where there is none, to the end."""
+    checkpoint = writer.latest_checkpoint()
+    if checkpoint is not None:
+        simulation.state = simulation.model.state_from(checkpoint[1])
+    else:
         writer.append(0, 0.0, simulation.positions, {})
         writer.checkpoint(0, simulation.state.arrays())
-    outer = [0]
+    motions = 0
 
-    def record(x, x_end) -> None:
-        writer.append_segments(simulation.steps_done + 1, outer[0], x.numpy(), x_end.numpy())
-        outer[0] += 1
+    def record(x: wp.array, x_end: wp.array) -> None:
+        nonlocal motions
+        writer.append_segments(simulation.steps_done + 1, motions, x.numpy(), x_end.numpy())
+        motions += 1
 
     if certify:
         simulation.observe = record
     last_checkpoint = time.monotonic()
     done = simulation.steps_done
+    whole = False  # whether the state is that of the last frame: an interrupt may come in the middle of a step
     try:
         while done < steps:
-            outer[0] = 0
+            whole, motions = False, 0
             result = simulation.step()
-            done = simulation.steps_done
-            writer.append(done, simulation.state.time, simulation.positions, stats_of(result))
+            writer.append(simulation.steps_done, simulation.state.time, simulation.positions, stats_of(result))
+            done, whole = simulation.steps_done, True
             if time.monotonic() - last_checkpoint > CHECKPOINT_SECONDS or done == steps:
                 writer.checkpoint(done, simulation.state.arrays())
                 last_checkpoint = time.monotonic()
             if progress is not None:
                 progress(StepInfo(done, steps, result))
     except KeyboardInterrupt:
-        writer.checkpoint(done, simulation.state.arrays())
+        if whole:
+            writer.checkpoint(done, simulation.state.arrays())
         raise

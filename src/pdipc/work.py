@@ -9,6 +9,7 @@ from pdipc import algorithm
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.collision.candidates import Candidates
 from pdipc.collision.truncation import Truncation
+from pdipc.device import system
 from pdipc.device.launch import Graph, one_at_a_time
 from pdipc.integration import inertia
 from pdipc.integration.loads import Loads
@@ -120,13 +121,13 @@ class Work:
     def start_clock(self) -> None:
         """Times and counts of the step begin."""
         device, k = self.device, self.kernels
-        device.launch_serial(k.start_clock, [self.clock])
+        device.launch_serial(k.start_clock, [*system.clock_call(), self.clock])
         counts = [self.count, self.method.inner, self.method.iterations, self.method.numbers, self.going]
         device.launch_serial(k.begin, counts)
 
     def mark(self, stage: str) -> None:
         """The time since the last mark belongs to `stage`."""
-        self.device.launch_serial(self.kernels.mark, [status.STAGES.index(stage), self.clock])
+        self.device.launch_serial(self.kernels.mark, [status.STAGES.index(stage), *system.clock_call(), self.clock])
 
     def predict(self) -> None:
         """Lines 1 and 2: z and x~, as displacements."""

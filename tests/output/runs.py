@@ -86,4 +86,5 @@ def begin(folder, as_json: str | None = None, precision: str = "float32", **kwar
 def write(folder, steps: int = 8, precision: str = "float32") -> np.ndarray:
     """A whole run; returns its last positions."""
     writer, state = begin(folder, precision=precision)
-    return advance(writer, state, range(1, steps + 1))
+    with writer:
+        return advance(writer, state, range(1, steps + 1))

@@ -112,6 +112,7 @@ def test_resuming_mends_the_file(tmp_path, damage):
     folder = tmp_path / "killed"
     writer, state = runs.begin(folder)
     runs.advance(writer, state, range(1, 6))  # checkpoints after 2 and 4
+    writer.close()
     path = folder / "run.vtkhdf"
     if damage == "garbage":
         path.write_bytes(bytes(range(256)) * 100)
@@ -165,7 +166,8 @@ def test_an_interrupted_append_leaves_the_steps_there_were(tmp_path, monkeypatch
         patched.setattr(np, "load", load_until_interrupted)
         runs.advance(writer, state, range(3, 5))
     assert_holds(tmp_path / "run", 3)
-    writer = RunWriter.resume(tmp_path / "run")
+    writer.close()
+    RunWriter.resume(tmp_path / "run").close()
     assert_holds(tmp_path / "run", 5)
 
 

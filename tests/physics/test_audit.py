@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 import pdipc
 from pdipc.audit import audit, body_forces, contact_forces, contact_pressures, replay
-from pdipc.cli.commands import app
+from pdipc.cli import app
 
 from .scenes import floor, scene, solid
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.collision import ccd
-from pdipc.device.launch import Device
+from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
 
@@ -45,6 +45,7 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(vertex_triangle=batch(functions.vertex_triangle), edge_edge=batch(functions.edge_edge))
 
 
+@one_at_a_time
 def time_of_impact(
     points: np.ndarray,
     kind: str,

@@ -1,8 +1,8 @@
 """Running kernels: on CUDA as they are, on the CPU split over threads, and both as recorded graphs.
 
 Warp runs a CPU launch on one core and releases Python's lock while it does. So on the CPU each launch is cut into one range a
-thread. A recorded graph goes further: every thread replays a graph of its own ranges in native code, and the threads meet at a
-spin barrier after each kernel, which costs about a microsecond where a hand-over through Python costs sixty. Kernels never
+thread. A recorded graph goes further: every thread replays a graph of its own ranges in native code, and the threads meet after
+each kernel, which costs about a microsecond (`system.meet_kernel`) where a hand-over through Python costs sixty. Kernels never
 depend on how a range was cut, so results are the same to the last bit for any number of threads, captured or not.
 
 Two kinds of kernels:
@@ -16,32 +16,15 @@ Two kinds of kernels:
 
 import functools
 import itertools
-import os
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
+from pdipc.device import system
+from pdipc.device import threads as shared
 from pdipc.device.precision import Real
-
-_ONE_AT_A_TIME = threading.RLock()
-
-
-def one_at_a_time(function: Callable) -> Callable:
-    """Decorator for what launches or records: callers in several threads take turns.
-
-    Warp has one recording at a time, and takes into it what any thread launches. A launch uses all cores anyway.
-    """
-
-    @functools.wraps(function)
-    def taking_turns(*args: Any, **kwargs: Any) -> Any:
-        with _ONE_AT_A_TIME:
-            return function(*args, **kwargs)
-
-    return taking_turns
-
+from pdipc.device.threads import one_at_a_time as one_at_a_time
 
 SCAN_BLOCK = 256  # numbers that a block of CUDA threads scans together
 REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads
@@ -61,38 +44,8 @@ class Span:
     block: int
 
 
-# The first thread to arrive waits for the others. Spinning is what makes it cheap; after a while it yields, so that a
-# machine with more threads than free cores still makes progress.
-_MEET = """
-    int sched_yield_(void) __asm__("sched_yield");
-    int* arrived = &meeting[0];
-    int* generation = &meeting[16];
-    int now = __atomic_load_n(generation, __ATOMIC_ACQUIRE);
-    if (__atomic_add_fetch(arrived, 1, __ATOMIC_ACQ_REL) == threads) {
-        __atomic_store_n(arrived, 0, __ATOMIC_RELAXED);
-        __atomic_add_fetch(generation, 1, __ATOMIC_ACQ_REL);
-    } else {
-        int spins = 0;
-        while (__atomic_load_n(generation, __ATOMIC_ACQUIRE) == now) {
-            if (++spins > 2000) { sched_yield_(); }
-        }
-    }
-"""
-
-
-@functools.cache
-def _meet_kernel() -> wp.Kernel:
-    module = wp.get_module(f"{__name__}.meet")
-    module.options["enable_backward"] = False
-
-    @wp.func_native(_MEET)
-    def meet(meeting: wp.array(dtype=wp.int32), threads: int): ...
-
-    @wp.kernel(module=module)
-    def meet_others(meeting: wp.array(dtype=wp.int32), threads: int):
-        meet(meeting, threads)
-
-    return meet_others  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+class ForkedError(RuntimeError):
+    """What lives on CUDA was used in the child of a fork."""
 
 
 class Graph:
@@ -103,21 +56,29 @@ class Graph:
         self._graphs = graphs
         self._keep_alive = keep_alive
 
+    @one_at_a_time
     def launch(self) -> None:
         """Replays the recorded kernels; on the CPU returns when all are done."""
-        others = [self._device._pool().submit(wp.capture_launch, graph) for graph in self._graphs[1:]]
-        wp.capture_launch(self._graphs[0])
-        for other in others:
-            other.result()
+        self._device.refuse_forked()
+        _together([functools.partial(wp.capture_launch, graph) for graph in self._graphs])
+
+
+def _together(parts: list[Callable[[], None]]) -> None:
+    """Runs all parts at once, the first one here."""
+    others = [shared.pool(len(parts) - 1).submit(part) for part in parts[1:]]
+    parts[0]()
+    for other in others:
+        other.result()
 
 
 class Device:
     """Where a model lives and how its kernels are launched.
 
     name: "cpu", "cuda:0", or None for CUDA where there is one, else the CPU.
-    threads: CPU threads; None for all cores this process may use (or the environment's PDIPC_THREADS).
+    threads: CPU threads; None for `threads.thread_count()`.
     """
 
+    @one_at_a_time
     def __init__(self, name: str | None = None, threads: int | None = None):
         wp.init()
         if name is None:
@@ -129,12 +90,11 @@ class Device:
             raise ValueError(f'device "{name}" is not available; this machine has: {known}') from error
         self.name = self.warp.alias
         self.is_cuda = self.warp.is_cuda
-        if threads is None:
-            threads = int(os.environ.get("PDIPC_THREADS", "0")) or len(os.sched_getaffinity(0))
-        self.threads = 1 if self.is_cuda else max(1, threads)
+        self.threads = 1 if self.is_cuda else threads or shared.thread_count()
         self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
-        self._meeting = None if self.is_cuda else wp.zeros(32, dtype=wp.int32, device=self.warp)
+        self._meeting = None if self.is_cuda else wp.zeros(system.MEETING, dtype=wp.int32, device=self.warp)
+        self._process = shared.process
 
     @functools.cached_property
     def records_loops(self) -> bool:
@@ -144,14 +104,19 @@ class Device:
     def __deepcopy__(self, memo: dict) -> "Device":
         return self
 
-    @functools.cache  # noqa: B019  (a device lives as long as the process)
-    def _pool(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(max(1, self.threads - 1), thread_name_prefix="pdipc")
+    def refuse_forked(self) -> None:
+        """Raises ForkedError in a process that got the device over a fork, where that does not work."""
+        if self.is_cuda and self._process != shared.process:
+            raise ForkedError(
+                f"this was made on {self.name} before the process forked, and CUDA does not survive a fork; "
+                'start processes with multiprocessing\'s "spawn", and make simulations in them'
+            )
 
     def _meet(self) -> None:
         if self.threads > 1:
-            wp.launch(_meet_kernel(), dim=1, inputs=[self._meeting, self.threads], device=self.warp)
+            wp.launch(system.meet_kernel(), dim=1, inputs=system.meet_inputs(self._meeting, self.threads), device=self.warp)
 
+    @one_at_a_time
     def launch(self, kernel: wp.Kernel, dim: int, inputs: Sequence[Any], grain: int = 1) -> None:
         """Runs `kernel(first, *inputs)` for indices 0 to dim - 1; each index is worth `grain` simple operations."""
         if self.is_cuda:
@@ -171,8 +136,9 @@ class Device:
                 wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp, record_cmd=True)
                 for low, high in itertools.pairwise(bounds)
             ]
-            self._launch_together(commands)
+            _together([command.launch for command in commands])
 
+    @one_at_a_time
     def launch_list(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
         """Runs `kernel(span, *inputs)` over a list of at most `capacity` entries whose length the kernel reads itself."""
         if self.is_cuda:
@@ -191,15 +157,9 @@ class Device:
                 wp.launch(kernel, dim=1, inputs=[_span(part, parts, CPU_BLOCK), *inputs], device=self.warp, record_cmd=True)
                 for part in range(parts)
             ]
-            self._launch_together(commands)
+            _together([command.launch for command in commands])
 
-    def _launch_together(self, commands: list[Any]) -> None:
-        """Runs recorded launches at once, one a thread."""
-        others = [self._pool().submit(command.launch) for command in commands[1:]]
-        commands[0].launch()
-        for other in others:
-            other.result()
-
+    @one_at_a_time
     def launch_serial(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         """Runs `kernel(0, *inputs)` once, in one thread: the last step of a sum, a counter, a decision."""
         if self._recording is None or self._recording == 0:
@@ -207,6 +167,7 @@ class Device:
         if self._recording is not None:
             self._meet()
 
+    @one_at_a_time
     def launch_scatter(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
         """Runs a kernel over a list that counts with integer atomics: in one thread on the CPU, where those are not atomic."""
         if self.is_cuda:
@@ -217,6 +178,7 @@ class Device:
             if self._recording is not None:
                 self._meet()
 
+    @one_at_a_time
     def copy(self, destination: wp.array, source: wp.array) -> None:
         """Copies an array inside or outside of a recording."""
         if self._recording is None or self._recording == 0:
@@ -224,6 +186,7 @@ class Device:
         if self._recording is not None:
             self._meet()
 
+    @one_at_a_time
     def once(self, operation: Callable[[], None]) -> None:
         """Runs, or records, what Warp does as one operation: a scan, the refit of a tree."""
         if self._recording is None or self._recording == 0:
@@ -231,6 +194,7 @@ class Device:
         if self._recording is not None:
             self._meet()
 
+    @one_at_a_time
     def scan(self, counts: wp.array, ends_out: wp.array) -> None:
         """ends_out[i] = counts[0] + ... + counts[i], int32.
 
@@ -259,17 +223,19 @@ class Device:
         """Runs `body` if the one int32 in `condition` is not zero; the body must launch before it changes that."""
         wp.capture_if(condition, body)
 
+    @one_at_a_time
     def capture(self, launches: Callable[[], None], keep_alive: Any = None) -> Graph:
         """Records what `launches()` launches and returns it as a graph; nothing is run.
 
         `launches` is called once for each CPU thread and must do the same each time. Kernels are compiled first where they
         were not yet. Arrays used must stay allocated as long as the graph: pass what owns them as keep_alive.
         """
+        self.refuse_forked()
         if self.is_cuda:
             with wp.ScopedCapture(device=self.warp) as capture:
                 launches()
             return Graph(self, [capture.graph], (launches, keep_alive))
-        wp.load_module(_meet_kernel().module, device=self.warp)
+        wp.load_module(system.meet_kernel().module, device=self.warp)
         graphs = []
         try:
             for part in range(self.threads):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device import system
 from pdipc.device.precision import Real
 from pdipc.nonlinear import status
 
@@ -12,21 +13,6 @@ from pdipc.nonlinear import status
 LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, FIRST_NUMBER = (wp.constant(status.COUNTS + place) for place in range(5))
 TIMES = wp.constant(status.COUNTS + 4 + status.NUMBERS)
 SIZE = status.COUNTS + 4 + status.NUMBERS + len(status.STAGES)
-
-# The step is one graph, so its stages are timed where it runs.
-_CLOCK = """
-#if defined(__CUDA_ARCH__)
-    unsigned long long now;
-    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(now));
-    return double(now) * 1e-6;
-#else
-    struct { long long seconds, nanoseconds; } now;
-    int clock_gettime_(int, void*) __asm__("clock_gettime");
-    clock_gettime_(1, &now);
-    return double(now.seconds) * 1e3 + double(now.nanoseconds) * 1e-6;
-#endif
-"""
-
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
@@ -143,21 +129,20 @@ def kernels(real: Real) -> SimpleNamespace:
         for stage in range(status.STARTED):
             report_out[TIMES + stage] = clock[stage]
 
-    @wp.func_native(_CLOCK)
-    def milliseconds() -> wp.float64: ...
+    milliseconds = system.milliseconds()  # the step is one graph, so its stages are timed where it runs
 
     @wp.kernel(module=module)
-    def start_clock(first: int, clock: wp.array(dtype=wp.float64)):
+    def start_clock(first: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         for i in range(clock.shape[0]):
             clock[i] = wp.float64(0.0)
-        now = milliseconds()
+        now = milliseconds(call, argument)
         clock[status.STARTED] = now
         clock[status.LAST] = now
 
     @wp.kernel(module=module)
-    def mark(first: int, stage: int, clock: wp.array(dtype=wp.float64)):
+    def mark(first: int, stage: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         """The time since the last mark belongs to `stage`."""
-        now = milliseconds()
+        now = milliseconds(call, argument)
         clock[stage] = clock[stage] + now - clock[status.LAST]
         clock[status.LAST] = now
 

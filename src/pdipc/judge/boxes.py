@@ -1,18 +1,29 @@
 """Which axis-aligned boxes overlap, in NumPy: for checks before and after a simulation, not for the simulation itself."""
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
+
+PART = 1 << 17  # pairs, and places where pairs may be, that are looked at together
 
 
 def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.ndarray) -> np.ndarray:
     """All (i, j) for which closed box i of a and box j of b share a point: (k, 2) int64, in no particular order.
 
-    low and high: (n, 3) finite corners. A hierarchy of grids: each box lives in the grid whose cells are just larger than it,
-    so that it touches at most eight; a pair meets in the coarser grid of the two.
+    low and high: (n, 3) finite corners.
+    """
+    return np.concatenate([np.zeros((0, 2), dtype=np.int64), *parts(low_a, high_a, low_b, high_b)])
+
+
+def parts(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.ndarray) -> Iterator[np.ndarray]:
+    """What `overlapping` returns, in parts of about PART pairs at most, so that memory does not grow with their number.
+
+    A hierarchy of grids: each box lives in the grid whose cells are just larger than it, so that it touches at most eight; a pair meets
+    in the coarser grid of the two.
     """
     if len(low_a) == 0 or len(low_b) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
+        return
     low_a, high_a, low_b, high_b = (np.asarray(corner, dtype=np.float64) for corner in (low_a, high_a, low_b, high_b))
     origin = np.minimum(low_a.min(axis=0), low_b.min(axis=0))
     extent = max(high_a.max(axis=0).max(), high_b.max(axis=0).max()) - origin.min()
@@ -22,7 +33,6 @@ def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b
         return np.ceil(np.log2(np.maximum((high - low).max(axis=1), finest) / finest)).astype(np.int64)
 
     level_a, level_b = levels(low_a, high_a), levels(low_b, high_b)
-    found = []
     for level in np.union1d(level_a, level_b):
         size = finest * 2.0**level * (1 + 1e-9)  # rounding must not let a box reach a third cell
         own_a, own_b = level_a == level, level_b == level
@@ -31,11 +41,10 @@ def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b
         for in_a, in_b in ((upto_a, own_b), (own_a, below_b)):
             a, b = np.flatnonzero(in_a), np.flatnonzero(in_b)
             if len(a) and len(b):
-                found.append(_join(a, b, low_a, high_a, low_b, high_b, origin, size))
-    return np.concatenate(found)
+                yield from _join(a, b, low_a, high_a, low_b, high_b, origin, size)
 
 
-def _join(a, b, low_a, high_a, low_b, high_b, origin, size) -> np.ndarray:
+def _join(a, b, low_a, high_a, low_b, high_b, origin, size) -> Iterator[np.ndarray]:
     """Pairs of boxes a and b, each no larger than `size`, through a grid of that size."""
     a = a[np.all((low_a[a] <= high_b[b].max(axis=0)) & (high_a[a] >= low_b[b].min(axis=0)), axis=1)]
 
@@ -58,8 +67,7 @@ def _join(a, b, low_a, high_a, low_b, high_b, origin, size) -> np.ndarray:
     begin, end = np.searchsorted(keys_b, keys_a, "left"), np.searchsorted(keys_b, keys_a, "right")
     counts = end - begin
     columns = [np.ascontiguousarray(corner.T) for corner in (low_a, high_a, low_b, high_b)]
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
-    for part in _parts(counts, 1 << 17):
+    for part in _parts(counts, PART):
         n = counts[part]
         rows = np.repeat(np.arange(part.start, part.stop), n)
         i = boxes_a[rows]
@@ -70,8 +78,7 @@ def _join(a, b, low_a, high_a, low_b, high_b, origin, size) -> np.ndarray:
             i, j, rows = i[kept], j[kept], rows[kept]
         # a pair that meets in several cells is taken from the one that holds the lower corner of its overlap
         here = _key(np.floor((np.maximum(low_a[i], low_b[j]) - origin) / size).astype(np.int64)) == keys_a[rows]
-        pairs.append(np.column_stack([i[here], j[here]]))
-    return np.concatenate(pairs)
+        yield np.column_stack([i[here], j[here]])
 
 
 def _key(cells: np.ndarray) -> np.ndarray:

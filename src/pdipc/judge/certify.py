@@ -7,6 +7,7 @@ one is, the pairs accused after it in the same motion are listed as they are.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,8 +47,10 @@ class Certificate:
     judge: str = ""
 
 
-def certify(run: Run) -> Certificate:
-    """Replays the recorded motions of `run`. Pairs of two obstacles are left out.
+def certify(run: Run, progress: Callable[[int, int], None] | None = None) -> Certificate:
+    """Replays the recorded motions of `run`, one at a time. Pairs of two obstacles are left out.
+
+    progress: called after each motion with the step that it belongs to and the number of motions so far.
 
     Raises RunError where the record does not lead without a break from the first frame through every other to the last.
     """
@@ -102,6 +105,8 @@ def certify(run: Run) -> Certificate:
         gaps = ipctk.NormalCollisions()
         gaps.build(candidates, mesh, x_end, near)
         certificate.smallest_gap = min(certificate.smallest_gap, gaps.compute_minimum_distance(mesh, x_end) ** 0.5)
+        if progress is not None:
+            progress(step, certificate.segments)
     certificate.seconds = time.perf_counter() - began
     return certificate
 

@@ -14,7 +14,6 @@ from pdipc.judge import boxes
 ORIENT2D_ERROR = (3.0 + 16.0 * 2.0**-53) * 2.0**-53  # Shewchuk's ccwerrboundA
 ORIENT3D_ERROR = (7.0 + 56.0 * 2.0**-53) * 2.0**-53  # Shewchuk's o3derrboundA
 UNDERFLOW = 1e-290  # far above what products lose by underflow
-CHUNK = 1 << 17  # pairs that are tested at a time
 
 
 def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: np.ndarray | None = None) -> np.ndarray:
@@ -56,13 +55,12 @@ def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: n
 def edge_triangle_crossings(positions: np.ndarray, edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(k, 2): edge and triangle that share no vertex and have a point in common."""
     ends, corners = positions[edges], positions[triangles]
-    candidates = boxes.overlapping(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
+    candidates = boxes.parts(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
     a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     normal_sum = _cross_of_magnitudes(u, v)
     found = [np.zeros((0, 2), dtype=np.int64)]
-    for begin in range(0, len(candidates), CHUNK):
-        pairs = candidates[begin : begin + CHUNK]
+    for pairs in candidates:
         e, t = edges[pairs[:, 0]], triangles[pairs[:, 1]]
         apart = np.all(e[:, :, None] != t[:, None, :], axis=(1, 2))
         pairs = pairs[apart]

@@ -11,6 +11,43 @@ FORMATS = ("usd", "ply", "obj", "vtk")
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 
 
+class Excerpt(Run):
+    """Every so many frames of a run, and of its bodies only those of the given names, with their copies; all where None.
+
+    Raises RunError for a name that the run does not have.
+    """
+
+    def __init__(self, run: Run, every: int = 1, bodies: list[str] | None = None):
+        base = [name.partition("[")[0] if name.endswith("]") else name for name in run.body_names]
+        if unknown := set(bodies or []) - {*run.body_names, *base}:
+            raise RunError(
+                f'{run.folder} has no body "{sorted(unknown)[0]}"; it has: {", ".join(dict.fromkeys(run.body_names))}'
+            )
+        kept = [bodies is None or bool({name, short} & set(bodies)) for name, short in zip(run.body_names, base, strict=True)]
+        of_vertex = run.topology["body_of_vertex"]
+        self._run, self._every = run, every
+        self._vertices = np.flatnonzero(np.array(kept)[of_vertex])
+        number = np.full(len(of_vertex), -1, dtype=np.int32)
+        number[self._vertices] = np.arange(len(self._vertices))
+
+        def own(elements: np.ndarray) -> np.ndarray:
+            return number[elements[np.array(kept)[of_vertex[elements[:, 0]]]]].reshape(-1, elements.shape[1])
+
+        self.folder, self.meta, self.scene, self.records = run.folder, run.meta, run.scene, run.records[::every]
+        self.topology = {
+            "triangles": own(run.triangles),
+            "tets": own(run.tets),
+            "body_of_vertex": (np.cumsum(kept) - 1)[of_vertex[self._vertices]],
+            "scripted": run.scripted[self._vertices],
+            "body_names": run.topology["body_names"][kept],
+            "body_kinds": run.topology["body_kinds"][kept],
+        }
+
+    def positions(self, frame: int) -> np.ndarray:
+        """(k, 3) m, of the vertices that the excerpt has."""
+        return self._run.positions(range(self._run.frame_count)[:: self._every][frame])[self._vertices]
+
+
 def export(run: Run, to: str, path: str | Path) -> Path:
     """Writes all frames of `run` in the format `to` and returns where: see the function of each format.
 

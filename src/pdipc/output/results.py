@@ -8,6 +8,7 @@
     run.vtkhdf      the same frames for ParaView, up to the last checkpoint
     checkpoints/    the last two states, bit for bit
     segments/       with --certify: the ends of every committed motion
+    run.lock        who is writing, while somebody is: see `lock`
 
 Every file is written under a temporary name and then renamed; a frame counts once its line in stats.jsonl is complete.
 run.vtkhdf alone grows in place: it is derived from the frames and written anew where a kill damaged it, see `vtkhdf`.
@@ -15,11 +16,13 @@ run.vtkhdf alone grows in place: it is derived from the frames and written anew 
 
 import json
 import math
+import numbers
 import os
 import platform
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,8 +30,10 @@ from typing import Any
 
 import numpy as np
 
+from pdipc.output import lock
+
 FORMAT = 1
-NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", "frames", "checkpoints", "segments"}
+NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", "frames", "checkpoints", "segments", lock.NAME}
 CHECKPOINTS_KEPT = 2
 UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
@@ -38,13 +43,17 @@ class RunError(RuntimeError):
 
 
 class RunWriter:
-    """Writes a run. Made by `create` or `resume`."""
+    """Writes a run, alone: the folder is locked until `close`, or the end of a `with`. Made by `create` or `resume`.
 
-    def __init__(self, run: "Run"):
+    What cannot be written, as on a full disk, raises RunError; the run goes on from its last checkpoint once there is room.
+    """
+
+    def __init__(self, run: "Run", held: lock.Lock):
         self.folder = run.folder
         self.topology = run.topology
         self.real = run.meta.get("precision", "float64")
         self.frames = [(record["step"], record["time"]) for record in run.records]
+        self._held = held
 
     @classmethod
     def create(
@@ -52,64 +61,98 @@ class RunWriter:
     ) -> "RunWriter":
         """A new run in `folder`. scene: as JSON. topology: arrays and lists by name, see above; meta: plain values.
 
-        Raises RunError where the folder holds a run already, unless `overwrite`, and always where it holds anything else.
+        Raises RunError where the folder holds a run already, unless `overwrite`, and always where it holds anything else or is being
+        written.
         """
         folder = Path(folder)
         if folder.exists() and not folder.is_dir():
             raise RunError(f"{folder} is a file; a run needs a folder")
         present = {entry.name for entry in folder.iterdir() if not entry.name.endswith(".tmp")} if folder.exists() else set()
-        if foreign := sorted(present - NAMES):
+        # a run whose making was killed has no run.json yet, but a lock; without either, the files are somebody else's
+        if foreign := sorted(present - NAMES if present & {"run.json", lock.NAME} else present):
             raise RunError(f'{folder} holds other files, such as "{foreign[0]}"; name a new folder for the run')
-        if present and not overwrite:
+        if "run.json" in present and not overwrite:
             raise RunError(f"{folder} holds a run already; go on with --resume, replace it with --overwrite, or name another")
-        for name in ("run.json", *sorted(present - {"run.json"})):
-            _remove(folder / name)
-        for name in ("frames", "checkpoints"):
-            (folder / name).mkdir(parents=True)
-        _write_text(folder / "scene.json", scene)
-        _write_arrays(folder / "topology.npz", topology)
-        _write_text(folder / "stats.jsonl", "")
-        _write_text(folder / "run.json", json.dumps({"format": FORMAT, **_versions(), **meta}, indent=2) + "\n")
-        return cls(open_run(folder))
+        with _room(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        held = _lock(folder)
+        try:
+            with _room(folder):
+                for name in ("run.json", *sorted(present - {"run.json", lock.NAME})):
+                    _remove(folder / name)
+                for path in folder.glob("*.tmp"):
+                    _remove(path)
+                for name in ("frames", "checkpoints"):
+                    (folder / name).mkdir(exist_ok=True)
+                _write_text(folder / "scene.json", scene)
+                _write_arrays(folder / "topology.npz", topology)
+                _write_text(folder / "stats.jsonl", "")
+                _write_text(folder / "run.json", json.dumps({"format": FORMAT, **_versions(), **meta}, indent=2) + "\n")
+            return cls(open_run(folder), held)
+        except BaseException:
+            held.release()
+            raise
 
     @classmethod
     def resume(cls, folder: str | Path) -> "RunWriter":
-        """Goes on after the last valid checkpoint of the run in `folder`; what was written after it is dropped.
+        """Goes on after the last valid checkpoint of the run in `folder`; what was written after it is dropped. A run that was killed
+        before its first step begins again.
 
-        Raises RunError where there is no run or no valid checkpoint.
+        Raises RunError where there is no run or no valid checkpoint, and where it is being written.
         """
-        run = open_run(folder)
-        checkpoint = cls(run).latest_checkpoint()
-        if checkpoint is None:
-            raise RunError(f"{folder} has no valid checkpoint to go on from; start again with --overwrite")
-        last = checkpoint[0]
-        kept = [record for record in run.records if record["step"] <= last]
-        _write_text(run.folder / "stats.jsonl", "".join(_line(record) for record in kept))
-        for path in [*run.folder.glob("*.tmp"), *run.folder.glob("*/*.tmp")]:
-            _remove(path)
-        for path in [path for name in ("frames", "checkpoints", "segments") for path in run.folder.glob(f"{name}/*.np?")]:
-            if int(path.stem.split("_")[0]) > last:
-                _remove(path)
-        writer = cls(open_run(folder))
-        writer._update_vtkhdf()
-        return writer
+        open_run(folder)
+        held = _lock(Path(folder))
+        try:
+            run = open_run(folder)  # as the last writer left it
+            checkpoint = _latest_checkpoint(run)
+            if checkpoint is None and run.stats:
+                raise RunError(f"{folder} has no valid checkpoint to go on from; start again with --overwrite")
+            last = -1 if checkpoint is None else checkpoint[0]
+            with _room(run.folder):
+                kept = [record for record in run.records if record["step"] <= last]
+                _write_text(run.folder / "stats.jsonl", "".join(_line(record) for record in kept))
+                for path in [*run.folder.glob("*.tmp"), *run.folder.glob("*/*.tmp")]:
+                    _remove(path)
+                for name in ("frames", "checkpoints", "segments"):
+                    for path in run.folder.glob(f"{name}/*.np?"):
+                        if _step_of(path) > last:
+                            _remove(path)
+            writer = cls(open_run(folder), held)
+            if writer.frames:
+                writer._update_vtkhdf()
+            return writer
+        except BaseException:
+            held.release()
+            raise
+
+    def close(self) -> None:
+        """Lets others write."""
+        self._held.release()
+
+    def __enter__(self) -> "RunWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def append(self, step: int, time: float, positions: np.ndarray, stats: dict[str, Any]) -> None:
         """Adds the frame of `step`: positions (n, 3), m, at `time`, s, and the statistics of the step."""
         positions = np.asarray(positions)
         single = positions.astype(np.float32)
         lossless = np.array_equal(single.astype(np.float64), positions)  # what a float32 simulation gives
-        _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
-        with open(self.folder / "stats.jsonl", "a") as file:
-            file.write(_line({"step": int(step), "time": float(time), **stats}))
+        with _room(self.folder):
+            _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
+            with open(self.folder / "stats.jsonl", "a", encoding="utf-8") as file:
+                file.write(_line({"step": int(step), "time": float(time), **stats}))
         self.frames.append((int(step), float(time)))
 
     def checkpoint(self, step: int, arrays: dict[str, Any]) -> None:
         """Saves the state after `step`, bit for bit, drops all but the last two, and brings run.vtkhdf up to date."""
-        folder = self.folder / "checkpoints"
-        _write_arrays(folder / f"{step:06d}.npz", arrays)
-        for path in sorted(folder.glob("*.npz"))[:-CHECKPOINTS_KEPT]:
-            _remove(path)
+        with _room(self.folder):
+            folder = self.folder / "checkpoints"
+            _write_arrays(folder / f"{step:06d}.npz", arrays)
+            for path in sorted(folder.glob("*.npz"), key=_step_of)[:-CHECKPOINTS_KEPT]:
+                _remove(path)
         self._update_vtkhdf()
 
     def _update_vtkhdf(self) -> None:
@@ -118,25 +161,56 @@ class RunWriter:
 
         times = np.array([time for _, time in self.frames])
         paths = [self.folder / "frames" / f"{step:06d}.npy" for step, _ in self.frames]
-        vtkhdf.update(self.folder / "run.vtkhdf", self.topology, self.real, times, paths)
+        with _room(self.folder):
+            vtkhdf.update(self.folder / "run.vtkhdf", self.topology, self.real, times, paths)
 
     def latest_checkpoint(self) -> tuple[int, dict[str, np.ndarray]] | None:
         """Step and arrays of the newest checkpoint that is whole and whose frames are all there; None where there is none."""
-        run = open_run(self.folder)
-        steps = {record["step"] for record in run.records}
-        for path in sorted((self.folder / "checkpoints").glob("*.npz"), reverse=True):
-            step = int(path.stem)
-            try:
-                if step in steps:
-                    return step, _read_arrays(path)
-            except UNREADABLE:
-                continue
-        return None
+        return _latest_checkpoint(open_run(self.folder))
 
     def append_segments(self, step: int, outer: int, start: np.ndarray, end: np.ndarray) -> None:
         """Records the motion (n, 3) -> (n, 3), m, that outer iteration `outer` of `step` committed."""
-        (self.folder / "segments").mkdir(exist_ok=True)
-        _write_arrays(self.folder / "segments" / f"{step:06d}_{outer:04d}.npz", {"start": start, "end": end})
+        with _room(self.folder):
+            (self.folder / "segments").mkdir(exist_ok=True)
+            _write_arrays(self.folder / "segments" / f"{step:06d}_{outer:04d}.npz", {"start": start, "end": end})
+
+
+def _lock(folder: Path) -> lock.Lock:
+    try:
+        with _room(folder):
+            return lock.Lock(folder)
+    except lock.LockedError as error:
+        raise RunError(str(error)) from None
+
+
+def _latest_checkpoint(run: "Run") -> tuple[int, dict[str, np.ndarray]] | None:
+    steps = {record["step"] for record in run.records}
+    for path in sorted((run.folder / "checkpoints").glob("*.npz"), key=_step_of, reverse=True):
+        try:
+            if _step_of(path) in steps:
+                return _step_of(path), _read_arrays(path)
+        except UNREADABLE:
+            continue
+    return None
+
+
+def _step_of(path: Path) -> int:
+    """Of a file of frames, checkpoints or segments; -1 of one that is none."""
+    step = path.stem.split("_")[0]
+    return int(step) if step.isascii() and step.isdigit() else -1
+
+
+@contextmanager
+def _room(folder: Path) -> Iterator[None]:
+    """Turns what the system says of a full disk, a limit or a missing right into RunError."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or folder
+        reason = error.strerror or str(error)
+        raise RunError(
+            f"{where} cannot be written: {reason}; what there is so far is kept: make room, then go on with --resume"
+        ) from error
 
 
 class Run:
@@ -152,10 +226,7 @@ class Run:
         if self.meta.get("format") != FORMAT:
             raise RunError(f"{folder / 'run.json'}: format {self.meta.get('format')}; this version reads format {FORMAT}")
         self.scene: dict[str, Any] = _read_json(folder / "scene.json")
-        try:
-            self.topology = _read_arrays(folder / "topology.npz")
-        except UNREADABLE as error:
-            raise RunError(f"{folder / 'topology.npz'} cannot be read: {error}") from error
+        self.topology = _read_topology(folder / "topology.npz")
         self.records = _read_records(folder / "stats.jsonl")
 
     @property
@@ -181,9 +252,15 @@ class Run:
             raise IndexError(f"{self.folder} has no frame {frame}; it has {self.frame_count} frames") from None
         path = self.folder / "frames" / f"{record['step']:06d}.npy"
         try:
-            return np.load(path).astype(np.float64)
+            found = np.load(path)
         except UNREADABLE as error:
             raise RunError(f"{path} cannot be read: {error}") from error
+        right = (len(self.topology["body_of_vertex"]), 3)
+        if found.shape != right or found.dtype.kind != "f":
+            raise RunError(
+                f"{path} holds {found.dtype} of shape {found.shape}; it must hold floating-point numbers of shape {right}"
+            )
+        return found.astype(np.float64)
 
     @property
     def triangles(self) -> np.ndarray:
@@ -228,8 +305,9 @@ class Run:
     def segments(self) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
         """Step, outer iteration, start (n, 3) and end (n, 3) of every motion recorded for the frames that count."""
         last = self.records[-1]["step"] if self.records else -1
-        for path in sorted((self.folder / "segments").glob("*.npz")):
-            step, outer = (int(part) for part in path.stem.split("_"))
+        named = ((path, path.stem.split("_")) for path in (self.folder / "segments").glob("*.npz"))
+        numbered = [(int(parts[0]), int(parts[1]), path) for path, parts in named if len(parts) == 2]
+        for step, outer, path in sorted(numbered):
             if step <= last:
                 try:
                     arrays = _read_arrays(path)
@@ -251,11 +329,16 @@ def open_run(folder: str | Path) -> Run:
 # --- files ---
 
 
-def _write(path: Path, write) -> None:
+def _write(path: Path, write: Callable) -> None:
     temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        write(file)
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -273,24 +356,101 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
+    if not isinstance(found, dict):
+        raise RunError(f"{path} holds {_short(found)}; it must hold a table")
+    return found
+
+
+# Of topology.npz: kind of numbers and shape, where a letter stands for a length that all arrays agree on.
+ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "triangles": ("iu", ("triangles", 3)),
+    "tets": ("iu", ("tets", 4)),
+    "body_of_vertex": ("iu", ("vertices",)),
+    "scripted": ("b", ("vertices",)),
+    "body_names": ("U", ("bodies",)),
+    "body_kinds": ("U", ("bodies",)),
+}
+
+
+def _read_topology(path: Path) -> dict[str, np.ndarray]:
+    try:
+        found = _read_arrays(path)
+    except UNREADABLE as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+    lengths: dict[str, int] = {}
+    for name, (kinds, shape) in ARRAYS.items():
+        if name not in found:
+            raise RunError(f'{path} lacks the array "{name}"')
+        array = found[name]
+        right = tuple(lengths.setdefault(n, k) if isinstance(n, str) else n for n, k in zip(shape, array.shape, strict=False))
+        if array.ndim != len(shape) or array.shape != right or (array.dtype.kind not in kinds and array.size):
+            raise RunError(
+                f"{path}: {name} holds {array.dtype} of shape {array.shape}; it must be ({', '.join(map(str, shape))})"
+            )
+    for name, below in (("triangles", "vertices"), ("tets", "vertices"), ("body_of_vertex", "bodies")):
+        wrong = found[name][(found[name] < 0) | (found[name] >= lengths[below])]
+        if len(wrong):
+            raise RunError(f"{path}: {name} names number {wrong[0]} of {lengths[below]} {below}")
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+# What readers rely on in a line of stats.jsonl; a step may tell more.
+STEP, TIME = (
+    ("a whole number that rises from line to line", _is_count),
+    ("a number of seconds that rises from line to line", _is_number),
+)
+FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "smallest_gap": ("a number or null", lambda value: value is None or _is_number(value)),
+    "residual": ("a number or null", lambda value: value is None or _is_number(value)),
+    "converged": ("true or false", lambda value: isinstance(value, bool)),
+    "outer": ("a whole number", _is_count),
+    "barriers": ("a whole number", _is_count),
+    "message": ("text", lambda value: isinstance(value, str)),
+    "milliseconds": ("a table of numbers", lambda value: isinstance(value, dict) and all(map(_is_number, value.values()))),
+}
 
 
 def _read_records(path: Path) -> list[dict[str, Any]]:
     """The complete lines; a last one that a kill cut short does not count."""
-    records = []
+    records: list[dict[str, Any]] = []
     try:
-        lines = path.read_text().split("\n")[:-1]
-    except OSError as error:
+        lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    except (OSError, ValueError) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
+    last = {"step": -1, "time": -math.inf}
     for number, line in enumerate(lines, 1):
+        where = f"{path}, line {number}"
         try:
-            records.append(json.loads(line))
-        except ValueError as error:
-            raise RunError(f"{path}, line {number}: {error}") from error
+            record = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise RunError(f"{where}: {error}") from error
+        if not isinstance(record, dict):
+            raise RunError(f"{where} holds {_short(record)}; it must hold a table")
+        for name, (right, fits) in {"step": STEP, "time": TIME}.items():
+            if not fits(record.get(name)) or record[name] <= last[name]:
+                raise RunError(f"{where}: {name} is {_short(record.get(name))}; it must be {right}")
+        for name, (right, fits) in FIELDS.items():
+            if name in record and not fits(record[name]):
+                raise RunError(f"{where}: {name} is {_short(record[name])}; it must be {right}")
+        records.append(record)
+        last = record
     return records
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _remove(path: Path) -> None:

@@ -7,7 +7,9 @@ The file is derived from frames/*.npy and may be lost at any time. It is written
 is open for writing: one that a kill left half-written is refused by every reader, and `update` writes it anew.
 """
 
+import errno
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ CELL_TYPES = {"tetra": 10, "triangle": 5}  # VTK's numbers
 OPENED = {"libver": ("v110", "v110"), "locking": False}
 DAMAGED = (OSError, KeyError, ValueError, RuntimeError)  # what h5py raises, by the place of the damage
 STEPS_PER_CHUNK = 1024  # of the small arrays with an entry per step
+SLACK = 1 << 18  # bytes that HDF5 takes beyond the arrays, at most
 
 
 def cells(topology: dict[str, np.ndarray]) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -33,18 +36,46 @@ def update(path: Path, topology: dict[str, np.ndarray], real: str, times: np.nda
     """Appends to the file the frames it lacks; writes it anew where it is missing, damaged, or holds what the run does not.
 
     real: "float32" or "float64", what positions are stored as. times: (k,) s. frames: k .npy files of positions (n, 3), m.
+    Raises OSError where there is no room for it: then the file is as it was, or is written anew the next time.
     """
-    if _appended(path, times, frames):
+    frame_bytes = 3 * len(topology["body_of_vertex"]) * np.dtype(real).itemsize
+    if _appended(path, times, frames, frame_bytes):
         return
     temporary = path.with_name(path.name + ".tmp")
-    with h5py.File(temporary, "w", **OPENED) as file:
-        root = file.create_group("VTKHDF")
-        _write_mesh(root, topology, real)
-        _append(root, times, frames)
-    os.replace(temporary, path)
+    try:
+        _must_fit(temporary, len(frames) * frame_bytes + 2 * sum(array.nbytes for array in topology.values()) + SLACK)
+        with h5py.File(temporary, "w", **OPENED) as file:
+            root = file.create_group("VTKHDF")
+            _write_mesh(root, topology, real)
+            _append(root, times, frames)
+        os.replace(temporary, path)
+    except DAMAGED as error:
+        temporary.unlink(missing_ok=True)
+        number, reason = getattr(error, "errno", None), getattr(error, "strerror", None)
+        raise OSError(number or errno.EIO, reason or str(error), str(path)) from error
 
 
-def _appended(path: Path, times: np.ndarray, frames: list[Path]) -> bool:
+def _must_fit(path: Path, more: int) -> None:
+    """Raises OSError where the disk, or a limit on files, has no room for so many more bytes at the end of the file.
+
+    HDF5 does not survive finding that out: it complains on stderr, and keeps what it could not write for later.
+    """
+    if shutil.disk_usage(path.parent).free < more:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with open(path, "ab") as file:
+        size = file.tell()
+        try:
+            os.posix_fallocate(file.fileno(), size, more)
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # disks that cannot reserve
+                raise
+        finally:
+            file.truncate(size)
+
+
+def _appended(path: Path, times: np.ndarray, frames: list[Path], frame_bytes: int) -> bool:
     """Brings a file up to date that begins as the run does; False where it does not, by its times and its last frame."""
     try:
         with h5py.File(path, "r+", **OPENED) as file:
@@ -54,6 +85,7 @@ def _appended(path: Path, times: np.ndarray, frames: list[Path]) -> bool:
                 return False
             if not np.array_equal(root["Points"][(held - 1) * size : held * size], np.load(frames[held - 1])):
                 return False
+            _must_fit(path, (len(frames) - int(held)) * frame_bytes + SLACK)
             _append(root, times, frames)
             return True
     except DAMAGED:

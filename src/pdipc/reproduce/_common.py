@@ -78,7 +78,7 @@ def stepped(scene: Scene, folder: Path, label: str, step: Callable[[int, Arrays]
         done, arrays = 0, {"positions": assembly.positions, "velocities": assembly.velocities}
         writer.append(0, 0.0, assembly.positions, {})
         writer.checkpoint(0, arrays)
-    with progress(label, scene.simulation.steps) as advance:
+    with writer, progress(label, scene.simulation.steps) as advance:
         for k in range(done, scene.simulation.steps):
             arrays, stats = step(k, arrays)
             writer.append(k + 1, (k + 1) * scene.simulation.time_step, arrays["positions"], stats)

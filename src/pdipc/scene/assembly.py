@@ -1,5 +1,8 @@
 """A scene as arrays: one numbering of all vertices, simulated and kinematic, and what is known about them."""
 
+import itertools
+import math
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -9,15 +12,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pdipc.scene import meshes
-from pdipc.scene.errors import SceneError
+from pdipc.scene.errors import SceneError, SceneWarning
+from pdipc.scene.frames import Frames, read_frames, timed
+from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import Mesh
-from pdipc.scene.motion import Trajectory, rotation_matrix
+from pdipc.scene.motion import Deforming, Trajectory, rotation_matrix
 from pdipc.scene.schema import (
     Arrays,
     Attachment,
     Body,
     Cloth,
     ClothMaterial,
+    Deformation,
     Obstacle,
     Placed,
     Scene,
@@ -27,8 +33,10 @@ from pdipc.scene.schema import (
     VertexForce,
     Wind,
 )
+from pdipc.scene.worker import Worker
 
 ACTIVATION_PART = 1e-3  # default activation distance, of the scene size
+BYTES_PER_VERTEX, BYTES_PER_BODY = 230, 4000  # of memory to put a scene together, measured
 SEPARATION_PART = 0.02  # default minimum separation, of the activation distance
 
 
@@ -50,7 +58,7 @@ class AssembledBody:
     material: SolidMaterial | ClothMaterial | None
     half_separation: float
     friction: float
-    trajectory: Trajectory | None = None
+    trajectory: Trajectory | Deforming | None = None
 
     @property
     def kinematic(self) -> bool:
@@ -118,6 +126,7 @@ class Assembly:
     follows from these, not from L: a distant partner changes nothing.
     activation_distance: d_hat, m; 1e-3 of the largest body unless the scene says otherwise.
     minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
+    notes: what was left out of files, or converted, a line each.
     """
 
     positions: np.ndarray
@@ -133,6 +142,7 @@ class Assembly:
     attachments: list[AssembledAttachment] = field(default_factory=list)
     winds: list[AssembledWind] = field(default_factory=list)
     forces: list[AssembledForce] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def triangles(self) -> np.ndarray:
@@ -185,28 +195,31 @@ class Assembly:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         return pin.trajectory.apply(self.positions[pin.vertices], time)
 
-    def _scripts(self) -> list[tuple[np.ndarray, Trajectory]]:
+    def _scripts(self) -> list[tuple[np.ndarray, Trajectory | Deforming]]:
         obstacles = [(np.arange(b.first, b.last), b.trajectory) for b in self.bodies if b.trajectory is not None]
         return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
 
 
-def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
+def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.ndarray]:
     """The mesh of a body or obstacle in its own coordinates, and its vertices at the start (n, 3), not yet placed.
 
-    Raises SceneError where it cannot be read or is of the wrong kind.
+    worker: reads files that other packages parse; None starts one where it is needed.
+    Raises SceneError where it cannot be read, is of the wrong kind, or needs more memory than there is.
     """
     where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
     source, start = placed.mesh, None
     try:
         if isinstance(source, str):
-            mesh = meshes.read(source)
+            mesh = meshes.read(source, worker)
         elif isinstance(source, Arrays):
             mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
             start = source.start
         else:
+            _need(source.bytes(), where, f"{source.cell_count()} cells", "fewer cells")
             mesh = source.mesh()
     except SceneError as error:
-        raise SceneError(f"{where}: {error}") from error
+        said = str(error)
+        raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
     if not isinstance(placed, Solid):
         if len(mesh.tets):
             mesh, start = mesh.surface(), None if start is None else start[np.unique(mesh.triangles)]
@@ -217,25 +230,102 @@ def load_mesh(placed: Placed) -> tuple[Mesh, np.ndarray]:
                 "tetrahedralize = true"
             )
         mesh = meshes.tetrahedralize(mesh, where)
+    if isinstance(placed, Obstacle):
+        mesh = meshes.without_useless(mesh, where)
     return mesh, mesh.vertices if start is None else start
+
+
+def load_deforming(placed: Obstacle, deformation: Deformation, worker: Worker | None = None) -> tuple[Mesh, Frames]:
+    """The mesh of an obstacle with a cache, with all vertices of its file, and the cache, not yet placed.
+
+    Raises SceneError where they cannot be read or do not go together.
+    """
+    where = f'obstacle "{placed.name}"'
+    source, cache = placed.mesh, deformation.cache
+    try:
+        if isinstance(cache, str):
+            frames, contents = read_frames(cache, deformation.frame_rate, worker)
+        else:
+            frames, contents = timed(cache.vertices, np.array(cache.times), deformation.frame_rate, "cache"), None
+        if isinstance(source, str):
+            path = meshes.locate(source)
+            if contents is None or source != cache:
+                contents = meshes.contents(path, worker, frames=True)
+            mesh = meshes.guarded(path, lambda: meshes.from_contents(contents, f'mesh file "{path}"', whole=True))
+        elif isinstance(source, Arrays):
+            mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
+        else:
+            _need(source.bytes(), where, f"{source.cell_count()} cells", "fewer cells")
+            mesh = source.mesh()
+        found, needed = frames.points.shape[1], len(mesh.vertices)
+        if found != needed:
+            raise SceneError(f"the cache has frames of {found} vertices; its mesh has {needed}, and each of them needs a place")
+    except SceneError as error:
+        said = str(error)
+        raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
+    first = Mesh(frames.points[0].astype(np.float64), mesh.triangles, notes=mesh.notes)
+    return meshes.without_useless(first, where), frames
+
+
+Read = tuple[Placed, Mesh, np.ndarray, Frames | None]  # a table, its mesh, where its vertices start, and its cache
+
+
+def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[Read]:
+    """All bodies and obstacles that can be had; adds the others to `problems` and `unread`."""
+    found = []
+    with Worker() as worker:
+        for placed in (*scene.bodies, *scene.obstacles):
+            where = f'{"obstacle" if isinstance(placed, Obstacle) else "body"} "{placed.name}"'
+            try:
+                frames = None
+                if isinstance(placed, Obstacle) and isinstance(placed.motion, Deformation):
+                    mesh, frames = load_deforming(placed, placed.motion, worker)
+                    start = mesh.vertices
+                else:
+                    mesh, start = load_mesh(placed, worker)
+                count = math.prod(placed.copies.counts) if isinstance(placed, Body) and placed.copies else 1
+                size = count * (BYTES_PER_BODY + BYTES_PER_VERTEX * len(start))
+                what = f"{count} copies of {len(start)} vertices" if count > 1 else f"{len(start)} vertices"
+                _need(size, where, what, "fewer copies" if count > 1 else "a coarser mesh")
+            except SceneError as error:
+                problems.append(str(error))
+                unread.add(placed.name)
+                continue
+            notes += [f"{where}: {note}" for note in mesh.notes]
+            found.append((placed, mesh, start, frames))
+    return found
+
+
+def _need(size: int, where: str, what: str, right: str) -> None:
+    """Raises SceneError where `size` bytes are more than there are."""
+    free = free_memory()
+    if size > free:
+        raise SceneError(f"{where}: {what} need at least {gib(size)} of memory, and {gib(free)} are free; take {right}")
 
 
 def assemble(scene: Scene) -> Assembly:
     """Reads the meshes of `scene`, places them, and numbers everything.
 
     Raises SceneError with all meshes that cannot be read, and all names and indices that are unknown. What is wrong with the
-    geometry is for `pdipc.scene.check` to find.
+    geometry is for `pdipc.scene.check` to find. Warns (SceneWarning) of what was left out of files.
     """
     assembly, problems = gather(scene)
     if assembly is None or problems:
         listed = [f"the scene cannot be put together, {len(problems)} things to put right:", *problems]
         raise SceneError(problems[0] if len(problems) == 1 else "\n  ".join(listed))
+    for note in assembly.notes:
+        warnings.warn(note, SceneWarning, stacklevel=2)
     return assembly
 
 
-def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is found by the check
+def gather(
+    scene: Scene, left_out: Iterable[str] = (), numbers: dict[str, list[int]] | None = None
+) -> tuple[Assembly | None, list[str]]:
     """What `assemble` makes, of all that can be read and is known, and a line for each thing that is not.
 
+    left_out: names of bodies that the file has and `scene` lacks. numbers: the places in the file of the scene's attachments and
+    forces, where these are others; see `pdipc.scene.load.RightPart`.
     None where not a single body can be read. Raises TypeError for what is no `Scene`.
     """
     if not isinstance(scene, Scene):
@@ -243,18 +333,17 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
             f"a scene is a pdipc.Scene, not a {type(scene).__name__}: use pdipc.Scene(**tables) or pdipc.load_scene(path)"
         )
     problems: list[str] = []
-    unread: set[str] = set()  # what refers to these is not judged
+    notes: list[str] = []
+    unread = set(left_out)  # what refers to these is not judged
     parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
     first = 0
-    for placed in (*scene.bodies, *scene.obstacles):
-        try:
-            mesh, start = load_mesh(placed)
-        except SceneError as error:
-            problems.append(str(error))
-            unread.add(placed.name)
-            continue
+    for placed, mesh, start, frames in _read_all(scene, problems, notes, unread):
         matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
         rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
+        deforming = None
+        if frames is not None:
+            deforming = Deforming(frames, placed.motion.start, matrix, placed.translation)
+            rest = start = deforming.apply(None, 0.0)
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
@@ -266,6 +355,7 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
                 placed.material if isinstance(placed, Solid | Cloth) else None,
                 half_separation=0.0,
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
+                trajectory=deforming,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):
@@ -293,11 +383,12 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
         (min(sizes), max(sizes)),
         activation_distance,
         minimum_separation,
+        notes=notes,
     )
     for body, placed, _, start, _ in parts:
         body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
         if isinstance(placed, Obstacle):
-            body.trajectory = Trajectory(placed.motion, _middle(start))
+            body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
         else:
             for number, pin in enumerate(placed.pins):
                 where = f'body "{body.name}", pins[{number}]'
@@ -307,11 +398,12 @@ def gather(scene: Scene) -> tuple[Assembly | None, list[str]]:
                     where += f".select = {pin.select}"
                     assembly.pins.append(AssembledPin(where, body.name, vertices, trajectory, pin.stiffness))
     assembly.velocities[assembly.kinematic_vertices] = 0.0
-    for number, attachment in enumerate(scene.attachments):
+    numbers = numbers or {}
+    for number, attachment in zip(numbers.get("attachments", itertools.count()), scene.attachments, strict=False):
         with _noting(problems):
             if _known(attachment.bodies, unread):
                 _attach(assembly, attachment, f"attachments[{number}]")
-    for number, force in enumerate(scene.forces):
+    for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
         with _noting(problems):
             if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
                 _force(assembly, force, f"forces[{number}]")
@@ -392,6 +484,8 @@ def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
             _in_range(body, [pair[side] for pair in table.pairs], where)
         pairs = np.array(table.pairs, dtype=np.int32).reshape(-1, 2)
     else:
+        if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
+            return  # the check says so
         near = cKDTree(assembly.positions[b.first : b.last])
         distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
         chosen = np.flatnonzero(np.isfinite(distance))

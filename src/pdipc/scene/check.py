@@ -1,7 +1,8 @@
 """What is refused before a simulation begins, with every finding at once."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse
@@ -12,26 +13,34 @@ from pdipc.judge.witness import find_intersections
 from pdipc.scene import meshes
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.errors import SceneError
+from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.schema import Scene
 
 LISTED = 5  # vertices that a finding names
-FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
+CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
+LARGEST = 1e9  # m, m/s: the cube of a larger coordinate is lost in single precision
 SEPARATION_ULPS = 100  # a minimum separation of fewer roundings of a coordinate is no protection
 # An activation distance of less than these is no range for forces to grow in. Measured on the bundled stack of boxes, in which nothing
 # is faster than 1.4 m/s, in float64: 1.3 m/s with 7e-8 of the scene size, 20 m/s with 3e-8, 350 m/s with 1e-8. In float32, where
 # forces are bounded sooner, speeds stay right down to one rounding; ten leave a range at all.
 ACTIVATION_PART, ACTIVATION_ULPS = 1e-7, 10
+# Vertices of one body that start nearer than this, as a part of the activation distance and in roundings, stay where they are: a step
+# may take a part of the gap, and no more. Measured on a sheet over another, of one body: with gaps of 1e-6 of the activation
+# distance and below some steps do not converge and vertices hang in the air, with 1e-5 and above all fall.
+CLOSEST_PART, CLOSEST_ULPS = 1e-5, 10
+REST_SEPARATION = 0.2  # that of `pdipc.collision.candidates`
 
 
 @dataclass(frozen=True)
 class Finding:
     """Something that must be put right. where: bodies or keys. found: what is wrong. right: what would be right, if that is not
-    in `found`.
+    in `found`. readable: False for what could not be read, or names what is not there; True for what was read and cannot be simulated.
     """
 
     where: str
     found: str
     right: str = ""
+    readable: bool = True
 
     def __str__(self) -> str:
         return f"{self.where}: {self.found}" + (f"; {self.right}" if self.right else "")
@@ -44,15 +53,32 @@ def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding
     """
     if isinstance(scene, Assembly):
         return _check(scene, precision or "float64")
-    assembly, problems = gather(scene)
-    findings = [*_settings(scene)]
-    for problem in problems:
-        where, _, found = problem.partition(": ")
-        findings.append(Finding(where, found))
+    return _check_scene(scene, precision, RightPart(scene, [], set(), {}))[0]
+
+
+def check_file(path: str | Path) -> tuple[list[Finding], list[str]]:
+    """What `check` finds in a scene file, also beside keys and values that are wrong in it; and what is left out of its meshes.
+
+    Raises SceneError where the file is missing or not in its format.
+    """
+    part = load_right_part(path)
+    findings, notes = _check_scene(part.scene, None, part) if part.scene is not None else ([], [])
+    return [*(_unreadable(problem) for problem in part.problems), *findings], notes
+
+
+def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[list[Finding], list[str]]:
+    assembly, problems = gather(scene, part.left_out, part.numbers)
+    findings = [*_settings(scene), *map(_unreadable, problems)]
     if assembly is None:
-        return findings
+        return findings, []
     precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
-    return findings + _check(assembly, precision, complete=not problems)
+    complete = not (problems or part.problems)
+    return findings + _check(assembly, precision, complete), assembly.notes
+
+
+def _unreadable(problem: str) -> Finding:
+    where, _, found = problem.partition(": ")
+    return Finding(where, found, readable=False)
 
 
 def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
@@ -92,10 +118,15 @@ def _rounding(assembly: Assembly, precision: str) -> float:
 
 def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Finding]:
     """complete: False where bodies are missing, so that the scene size is not known, and no distance that follows from it."""
-    findings = [finding for body in assembly.bodies for finding in _numbers(assembly, body)]
-    if findings:  # geometry is meaningless then
+    numbers = {body.name: list(_numbers(assembly, body)) for body in assembly.bodies}
+    findings = [finding for found in numbers.values() for finding in found]
+    there = [body for body in assembly.bodies if not numbers[body.name]]
+    if all(body.kinematic for body in there):
         return findings
-    for body in assembly.bodies:
+    if findings:  # what has no place has no geometry
+        complete = False
+        assembly = _without(assembly, {name for name, found in numbers.items() if found})
+    for body in there:
         findings += _elements(assembly, body)
     findings += _selections(assembly)
     findings += _motions(assembly)
@@ -105,7 +136,7 @@ def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Fi
     touching, found = _intersections(assembly, precision)
     findings += [*found, *distances]
     if complete:
-        findings += _too_close(assembly, touching)
+        findings += _too_close(assembly, touching, precision)
     return findings + list(_inside(assembly, touching))
 
 
@@ -118,30 +149,48 @@ def _at(point: np.ndarray) -> str:
 
 
 def _numbers(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
-    for name in ("rest_positions", "positions", "velocities"):
-        bad = np.flatnonzero(~np.isfinite(getattr(assembly, name)[body.first : body.last]).all(axis=1))
-        if len(bad):
-            value = getattr(assembly, name)[body.first + bad[0]].tolist()
-            found = f"{name} of {len(bad)} vertices are not finite, first vertex {bad[0]} = {value}"
-            yield Finding(_label(body), found, "they must be numbers")
-            return
+    """What is no number, or too large a one: the first of these."""
+    own = slice(body.first, body.last)
+    for name, unit in (("rest_positions", "m"), ("positions", "m"), ("velocities", "m/s")):
+        values = getattr(assembly, name)[own]
+        for wrong, what, right in (
+            (~np.isfinite(values), "are not finite", "they must be numbers"),
+            (np.abs(values) > LARGEST, f"are beyond {LARGEST:g} {unit}", f"they must be at most {LARGEST:g} {unit}"),
+        ):
+            bad = np.flatnonzero(wrong.any(axis=1))
+            if len(bad):
+                found = f"{name} of {len(bad)} vertices {what}, first vertex {bad[0]} = {values[bad[0]].tolist()}"
+                yield Finding(_label(body), found, right)
+                return
+
+
+def _without(assembly: Assembly, names: set[str]) -> Assembly:
+    """The assembly with nothing of these bodies left but their vertices, all at the origin: so that the others can be judged."""
+    bodies, places = [], {name: getattr(assembly, name).copy() for name in ("rest_positions", "positions", "velocities")}
+    for body in assembly.bodies:
+        if body.name in names:
+            body = replace(body, tets=body.tets[:0], triangles=body.triangles[:0], trajectory=None)
+            for values in places.values():
+                values[body.first : body.last] = 0.0
+        bodies.append(body)
+    pins = [pin for pin in assembly.pins if pin.body not in names]
+    return replace(assembly, bodies=bodies, pins=pins, **places)
 
 
 def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     label, first = _label(body), body.first
     kind, elements = ("tets", body.tets) if body.kind == "solid" else ("triangles", body.triangles)
-    corners = assembly.rest_positions[elements]
-    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
     if body.kind == "solid":
         volumes = meshes.tet_volumes(assembly.rest_positions, elements)
-        inverted = np.flatnonzero(volumes < -FLAT * longest**3)
+        smallest = meshes.FLAT * meshes.longest_edges(assembly.rest_positions, elements) ** 3
+        inverted = np.flatnonzero(volumes < -smallest)
         if len(inverted):
             example = f"tets[{inverted[0]}] = {(elements[inverted[0]] - first).tolist()}"
             found = f"{len(inverted)} of {len(elements)} tets are inverted, first {example}"
             yield Finding(label, found, "every tet needs positive volume: swap two of its vertices")
-        flat = np.flatnonzero(np.abs(volumes) <= FLAT * longest**3)
+        flat = np.flatnonzero(np.abs(volumes) <= smallest)
     else:
-        flat = np.flatnonzero(meshes.triangle_areas(assembly.rest_positions, elements) <= FLAT * longest**2)
+        flat = np.flatnonzero(meshes.flat_triangles(assembly.rest_positions, elements))
     if len(flat):
         measure = "volume" if body.kind == "solid" else "area"
         example = f"{kind}[{flat[0]}] = {(elements[flat[0]] - first).tolist()}"
@@ -151,6 +200,8 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     if counts.max() > 1:
         found = f"{np.count_nonzero(counts > 1)} {kind} are there more than once"
         yield Finding(label, found, "each must be there once")
+    if body.kinematic:  # only what bends needs to be a manifold
+        return
     sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, counts = np.unique(sides, axis=0, return_counts=True)
     crowded = np.flatnonzero(counts > 2)
@@ -269,50 +320,124 @@ def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, i
     return touching, findings
 
 
-def _too_close(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Finding]:
-    """Pairs of bodies that come as near as their minimum separation."""
+def _too_close(assembly: Assembly, touching: set[tuple[int, int]], precision: str) -> Iterator[Finding]:
+    """Pairs of bodies, or parts of one body, that come as near as their minimum separation."""
+    found = [_near_others(assembly), _near_itself(assembly, precision)]
+    distances, limits, pairs, places = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    for i, j in np.unique(pairs, axis=0):
+        if (int(i), int(j)) in touching:
+            continue
+        own = np.flatnonzero(np.all(pairs == (i, j), axis=1))
+        nearest = own[np.argmin(distances[own])]
+        example = f"the nearest {distances[nearest]:.3g} m apart near {_at(places[nearest])} m"
+        found = f"{len(own)} pairs of vertices, edges or triangles start too close, {example}"
+        if i != j:
+            right = f"their gap must be more than the minimum separation of {limits[nearest]:.3g} m"
+        else:
+            right = f"their gap must be more than {limits[nearest]:.3g} m: the minimum separation, or less where they are near at rest"
+        names = dict.fromkeys(_label(assembly.bodies[k]) for k in (i, j))
+        yield Finding(" and ".join(names), found, right)
+
+
+Near = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # distances, limits (k,) m, bodies (k, 2), places (k, 3) m
+
+
+def _near_others(assembly: Assembly) -> Near:
+    """Pairs of primitives of two bodies that are no further apart than their minimum separation."""
     x, owner = assembly.positions, assembly.body_of_vertex
     reach = np.array([body.half_separation for body in assembly.bodies])
     kinematic = np.array([body.kinematic for body in assembly.bodies])
     low = np.array([x[body.first : body.last].min(axis=0) for body in assembly.bodies]) - reach[:, None]
     high = np.array([x[body.first : body.last].max(axis=0) for body in assembly.bodies]) + reach[:, None]
 
-    def near_others(primitives: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The primitives whose boxes reach into another body's box, and their boxes."""
+    def near(primitives: np.ndarray) -> np.ndarray:
+        """The primitives whose boxes reach into another body's box."""
         corners, margin = x[primitives], reach[owner[primitives[:, 0]]][:, None]
-        p_low, p_high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
-        met = boxes.overlapping(p_low, p_high, low, high)
-        kept = np.unique(met[owner[primitives[met[:, 0], 0]] != met[:, 1], 0])
-        return primitives[kept], p_low[kept], p_high[kept]
+        met = boxes.overlapping(corners.min(axis=1) - margin, corners.max(axis=1) + margin, low, high)
+        return primitives[np.unique(met[owner[primitives[met[:, 0], 0]] != met[:, 1], 0])]
 
-    def candidates(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        pairs = boxes.overlapping(*a[1:], *b[1:])
-        first, second = a[0][pairs[:, 0]], b[0][pairs[:, 1]]
-        i, j = owner[first[:, 0]], owner[second[:, 0]]
-        apart = (i != j) & ~(kinematic[i] & kinematic[j])
-        return first[apart], second[apart]
+    def apart(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        return (owner[i] != owner[j]) & ~(kinematic[owner[i]] & kinematic[owner[j]])
 
-    triangles = assembly.triangles
+    def limit(a: np.ndarray, b: np.ndarray, _) -> np.ndarray:
+        return reach[owner[a]] + reach[owner[b]]
+
+    primitives = [near(kind) for kind in _primitives(assembly.triangles)]
+    return _nearer(assembly, primitives, reach[owner], apart, limit)
+
+
+def _near_itself(assembly: Assembly, precision: str) -> Near:
+    """Pairs of primitives of one body that are no further apart than their minimum separation.
+
+    It is smaller for a pair that is close in the rest shape, by the rule of `pdipc.collision.candidates.limits`. What is closer than
+    rounding, or than a small part of the activation distance, could not move at all, and is found as well.
+    """
+    x, owner = assembly.positions, assembly.body_of_vertex
+    least = max(CLOSEST_PART * assembly.activation_distance, CLOSEST_ULPS * _rounding(assembly, precision))
+    reach = np.zeros(len(x))
+    for body in assembly.bodies:
+        own = slice(body.first, body.last)
+        at_rest = np.array_equal(x[own], assembly.rest_positions[own].astype(precision).astype(np.float64))
+        reach[own] = 0.5 * least if at_rest else max(body.half_separation, 0.5 * least)
+
+    def limit(a: np.ndarray, b: np.ndarray, at_rest: np.ndarray) -> np.ndarray:
+        return np.maximum(np.minimum(reach[a] + reach[b], REST_SEPARATION * at_rest), least)
+
+    surface = np.concatenate([body.triangles for body in assembly.bodies if not body.kinematic])
+    return _nearer(assembly, _primitives(surface), reach, lambda a, b: owner[a] == owner[b], limit)
+
+
+def _primitives(triangles: np.ndarray) -> list[np.ndarray]:
+    """Vertices (s, 1), edges (k, 2) and triangles (m, 3)."""
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-    faces, lines = near_others(triangles), near_others(edges)
-    points = near_others(np.unique(triangles)[:, None])
-    v, t = candidates(points, faces)
-    e, f = candidates(lines, lines)
-    distances = np.concatenate([vertex_triangle_distances(x[v[:, 0]], x[t]), edge_edge_distances(x[e], x[f])])
-    first, second = np.concatenate([v[:, 0], e[:, 0]]), np.concatenate([t[:, 0], f[:, 0]])
-    pairs = np.sort(np.column_stack([owner[first], owner[second]]), axis=1)
-    places = np.concatenate([x[v[:, 0]], x[e].mean(axis=1)])
-    close = distances <= reach[pairs[:, 0]] + reach[pairs[:, 1]]
-    distances, pairs, places = distances[close], pairs[close], places[close]
-    for i, j in np.unique(pairs, axis=0):
-        if (int(i), int(j)) in touching:
-            continue
-        own = np.all(pairs == (i, j), axis=1)
-        nearest = np.flatnonzero(own)[np.argmin(distances[own])]
-        example = f"the nearest {distances[nearest]:.3g} m apart near {_at(places[nearest])} m"
-        found = f"{np.count_nonzero(own)} pairs of vertices, edges or triangles start too close, {example}"
-        right = f"their gap must be more than the minimum separation of {reach[i] + reach[j]:.3g} m"
-        yield Finding(f"{_label(assembly.bodies[i])} and {_label(assembly.bodies[j])}", found, right)
+    return [np.unique(triangles)[:, None], edges, triangles]
+
+
+def _nearer(assembly: Assembly, primitives: list[np.ndarray], reach: np.ndarray, wanted: Callable, limit: Callable) -> Near:
+    """Pairs of a vertex and a triangle, and of two edges, that share no vertex and are no further apart than their limit.
+
+    reach: (n,) m, at least half of any limit at a vertex. wanted(i, j): whether vertices i (k,) and j (k,) are a pair's.
+    limit(i, j, d): m, from vertices of a pair and its distance at rest.
+    """
+    x, rest = assembly.positions, assembly.rest_positions
+    points, edges, triangles = primitives
+    found: list[Near] = []
+    for first, second, distance in ((points, triangles, _vertex_triangle), (edges, edges, edge_edge_distances)):
+        bounds = [(x[kind] - reach[kind][..., None], x[kind] + reach[kind][..., None]) for kind in (first, second)]
+        (low_a, high_a), (low_b, high_b) = ((low.min(axis=1), high.max(axis=1)) for low, high in bounds)
+        for begin in range(0, len(first), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            a, b = boxes.overlapping(low_a[part], high_a[part], low_b, high_b).T
+            a += begin
+            if first is second:
+                a, b = a[a < b], b[a < b]
+            kept = wanted(first[a, 0], second[b, 0]) & np.all(first[a][:, :, None] != second[b][:, None], axis=(1, 2))
+            i, j = first[a[kept]], second[b[kept]]
+            distances = distance(x[i], x[j])
+            limits = limit(i[:, 0], j[:, 0], distance(rest[i], rest[j]))
+            close = distances <= limits
+            i, j = i[close], j[close]
+            owners = np.sort(assembly.body_of_vertex[np.column_stack([i[:, 0], j[:, 0]])], axis=1)
+            found.append((distances[close], limits[close], owners, _place(x[i], x[j]) if first is second else x[i][:, 0]))
+    nothing = (np.zeros(0), np.zeros(0), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)))
+    return tuple(np.concatenate(column) for column in zip(nothing, *found, strict=True))
+
+
+def _place(e: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """(n, 3) points of segments e that are nearest to segments f, both (n, 2, 3): ends, feet of the ends of f, or the crossing."""
+    u, v, w = e[:, 1] - e[:, 0], f[:, 1] - f[:, 0], e[:, 0] - f[:, 0]
+    uu, uv, vv, uw, vw = (np.einsum("ij,ij->i", a, b) for a, b in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    square = uu * vv - uv * uv
+    crossing = (uv * vw - vv * uw) / np.where(square > 0, square, 1.0)
+    feet = [np.einsum("ij,ij->i", f[:, k] - e[:, 0], u) / np.where(uu > 0, uu, 1.0) for k in (0, 1)]
+    parts = np.clip(np.column_stack([np.zeros(len(e)), np.ones(len(e)), *feet, crossing]), 0.0, 1.0)
+    points = e[:, :1] + parts[..., None] * u[:, None]
+    distances = [point_segment_distances(points[:, k], f[:, 0], f[:, 1]) for k in range(parts.shape[1])]
+    return points[np.arange(len(e)), np.argmin(distances, axis=0)] if len(e) else np.zeros((0, 3))
+
+
+def _vertex_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    return vertex_triangle_distances(points[:, 0], triangles)
 
 
 def _inside(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Finding]:

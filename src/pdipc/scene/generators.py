@@ -6,23 +6,31 @@ of neighbouring cells match, and no tet lies flat where a rounded shape takes up
 """
 
 import itertools
+import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from pdipc.scene.meshes import Mesh
+from pdipc.scene.tables import Real, Table, Whole
 
-Length = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=4096)]
-Across = Annotated[int, Field(ge=2, le=1024)]
+Length = Annotated[Real, Field(gt=0, le=1e6, allow_inf_nan=False)]
+Count = Annotated[Whole, Field(ge=1, le=4096)]
+Across = Annotated[Whole, Field(ge=2, le=1024)]
 Vector = tuple[Length, Length, Length]
 
 
-class Shape(BaseModel):
-    """What all shapes share: no unknown keys."""
+class Shape(Table):
+    """What all shapes share."""
 
-    model_config = ConfigDict(extra="forbid")
+    def cell_count(self) -> int:
+        """Number of the cells that `mesh` cuts."""
+        raise NotImplementedError
+
+    def bytes(self) -> int:
+        """Memory that `mesh` needs, measured."""
+        return self.cell_count() * (250 if isinstance(self, Grid | Plane) else 2300)
 
     def mesh(self) -> Mesh:
         """The shape about its origin: tets with their surface, or triangles for the open shapes."""
@@ -36,6 +44,9 @@ class Box(Shape):
     size: Vector = Field(default=(1.0, 1.0, 1.0), description="Extent along x, y, z, m.")
     cells: tuple[Count, Count, Count] = Field(default=(4, 4, 4), description="Cells along x, y, z; each is cut into six tets.")
 
+    def cell_count(self) -> int:
+        return math.prod(self.cells)
+
     def mesh(self) -> Mesh:
         points, tets = lattice(self.cells)
         return Mesh.of_tets(0.5 * points * self.size, tets)
@@ -47,6 +58,9 @@ class Sphere(Shape):
     shape: Literal["sphere"] = "sphere"
     radius: Length = Field(default=0.5, description="Radius, m.")
     cells: Across = Field(default=8, description="Cells across the diameter.")
+
+    def cell_count(self) -> int:
+        return self.cells**3
 
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells, self.cells, self.cells))
@@ -61,6 +75,9 @@ class Cylinder(Shape):
     length: Length = Field(default=1.0, description="Extent along y, m.")
     cells: tuple[Across, Count] = Field(default=(6, 6), description="Cells across the diameter and along y.")
 
+    def cell_count(self) -> int:
+        return self.cells[0] ** 2 * self.cells[1]
+
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells[0], self.cells[1], self.cells[0]))
         disc = self.radius * rounded(points[:, [0, 2]])
@@ -73,9 +90,12 @@ class Capsule(Shape):
     shape: Literal["capsule"] = "capsule"
     radius: Length = Field(default=0.25, description="Radius, m.")
     length: Length = Field(default=0.5, description="Extent of the cylinder along y, without the half balls, m.")
-    cells: tuple[Annotated[int, Field(ge=2, le=1024, multiple_of=2)], Count] = Field(
+    cells: tuple[Annotated[Whole, Field(ge=2, le=1024, multiple_of=2)], Count] = Field(
         default=(6, 4), description="Cells across the diameter (even), and along the cylinder."
     )
+
+    def cell_count(self) -> int:
+        return self.cells[0] ** 2 * sum(self.cells)
 
     def mesh(self) -> Mesh:
         across, along = self.cells
@@ -94,11 +114,16 @@ class Torus(Shape):
     shape: Literal["torus"] = "torus"
     major_radius: Length = Field(default=0.5, description="Radius of the ring's centre line, m; larger than minor_radius.")
     minor_radius: Length = Field(default=0.2, description="Radius of its section, m.")
-    cells: tuple[Across, Annotated[int, Field(ge=3, le=4096)]] = Field(default=(4, 24), description="Cells across and around.")
+    cells: tuple[Across, Annotated[Whole, Field(ge=3, le=4096)]] = Field(
+        default=(4, 24), description="Cells across and around."
+    )
 
     def model_post_init(self, _) -> None:
         if self.minor_radius >= self.major_radius:
             raise ValueError(f"minor_radius {self.minor_radius} must be smaller than major_radius {self.major_radius}")
+
+    def cell_count(self) -> int:
+        return self.cells[0] ** 2 * self.cells[1]
 
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells[0], self.cells[0], self.cells[1]), ring=True)
@@ -114,8 +139,11 @@ class Bowl(Shape):
     shape: Literal["bowl"] = "bowl"
     radius: Length = Field(default=1.0, description="Inner radius, m.")
     thickness: Length = Field(default=0.05, description="Thickness of the shell, outward, m.")
-    opening: float = Field(default=80.0, gt=0, le=150, description="Angle between the downward axis and the rim, degrees.")
+    opening: Real = Field(default=80.0, gt=0, le=150, description="Angle between the downward axis and the rim, degrees.")
     cells: tuple[Across, Count] = Field(default=(16, 1), description="Cells across the bowl, and through its thickness.")
+
+    def cell_count(self) -> int:
+        return self.cells[0] ** 2 * self.cells[1]
 
     def mesh(self) -> Mesh:
         points, tets = lattice((self.cells[0], self.cells[1], self.cells[0]))
@@ -131,10 +159,13 @@ class Stairs(Shape):
     """Solid steps that go down along +x; the origin is the middle of the lowest edge at the foot of the highest step."""
 
     shape: Literal["stairs"] = "stairs"
-    steps: Annotated[int, Field(ge=1, le=100)] = Field(default=5, description="Number of steps.")
+    steps: Annotated[Whole, Field(ge=1, le=100)] = Field(default=5, description="Number of steps.")
     rise: Length = Field(default=0.2, description="Height of a step, m.")
     run: Length = Field(default=0.3, description="Depth of a step along x, m.")
     width: Length = Field(default=2.0, description="Extent along z, m.")
+
+    def cell_count(self) -> int:
+        return self.steps**2
 
     def mesh(self) -> Mesh:
         n = self.steps
@@ -161,6 +192,9 @@ class Grid(Shape):
         default="alternating", description='How cells are cut: "alternating" favours no direction, "parallel" cuts all alike.'
     )
 
+    def cell_count(self) -> int:
+        return math.prod(self.cells)
+
     def mesh(self) -> Mesh:
         nx, nz = self.cells
         x, z = np.meshgrid(np.linspace(-0.5, 0.5, nx + 1), np.linspace(-0.5, 0.5, nz + 1), indexing="ij")
@@ -179,6 +213,9 @@ class Plane(Shape):
 
     shape: Literal["plane"] = "plane"
     size: Length = Field(default=10.0, description="Length of a side, m.")
+
+    def cell_count(self) -> int:
+        return 1
 
     def mesh(self) -> Mesh:
         return Grid(size=(self.size, self.size), cells=(1, 1)).mesh()

@@ -3,16 +3,21 @@
 import difflib
 import json
 import tomllib
-import typing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from pdipc.scene.errors import SceneError
+from pdipc.scene.explain import clipped, explain, follow
+from pdipc.scene.memory import free_memory, gib
+from pdipc.scene.meshes import is_file
 from pdipc.scene.schema import Scene
 
 BUNDLED = Path(__file__).parent.parent / "scenes"
+BYTES_PER_BYTE = 30  # of memory for a scene file: what its numbers take as Python's
+LISTS = ("bodies", "obstacles", "attachments", "forces")
 
 
 def bundled_scenes() -> dict[str, Path]:
@@ -26,123 +31,102 @@ def load_scene(path: str | Path) -> Scene:
     Mesh paths in the file are relative to it. Raises SceneError; its message names the file and, for every problem at once, the
     key, the value found, and what is allowed.
     """
-    file = bundled_scenes().get(str(path), Path(path))
-    if not file.is_file():
-        near = difflib.get_close_matches(str(path), bundled_scenes(), n=1)
-        hint = f'did you mean "{near[0]}"? ' if near else ""
-        raise SceneError(f'"{path}": there is no such file; {hint}bundled scenes: {", ".join(bundled_scenes())}')
-    try:
-        if file.suffix == ".json":
-            data = json.loads(file.read_text(encoding="utf-8-sig"))  # some editors begin a file with a mark
-        elif file.suffix == ".toml":
-            data = tomllib.loads(file.read_text(encoding="utf-8-sig"))
-        else:
-            raise SceneError(f'"{file}": a scene file ends in .toml or .json')
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f'"{file}": is not valid {file.suffix[1:].upper()}: {error}') from error
+    file, data = _tables(path)
     try:
         return Scene.model_validate(data, context={"folder": file.parent})
     except ValidationError as error:
-        lines = explain(error, data)
+        lines = explain(error, data, Scene)
         raise SceneError(f'"{file}": ' + (lines[0] if len(lines) == 1 else "\n  ".join(["", *lines]))) from error
 
 
-def explain(error: ValidationError, data: Any) -> list[str]:
-    """One line for each thing wrong in `data`: key, value found, what is allowed."""
-    lines: dict[tuple[str, str], str] = {}
-    for problem in error.errors():
-        where, said, about = _line(problem, data)
-        # a key that may be of two kinds is reported by pydantic for each of them
-        lines[where, about] = f"{lines[where, about]}, or: {said}" if (where, about) in lines else said
-    return [f"{where}: {said}{about}" for (where, about), said in lines.items()]
+@dataclass
+class RightPart:
+    """A scene file without what is wrong in it.
+
+    scene: None where not one body is right. problems: a line for each thing wrong. left_out: names of the bodies and obstacles that
+    are not in `scene`. numbers: for each list of the file, the places in it of what is in `scene`.
+    """
+
+    scene: Scene | None
+    problems: list[str]
+    left_out: set[str]
+    numbers: dict[str, list[int]]
 
 
-def _line(problem: Any, data: Any) -> tuple[str, str, str]:
-    """Key and value found, what is wrong with it, what the key means."""
-    keys, models = _follow(problem["loc"], data)
-    where = _path(keys, data)
-    kind, found = problem["type"], _short(problem["input"])
-    if kind == "extra_forbidden":
-        allowed = sorted({name for model in models for name in model.model_fields})
-        near = difflib.get_close_matches(str(keys[-1]), allowed, n=1)
-        hint = f'; did you mean "{near[0]}"?' if near else ""
-        return f"{where} = {found}", f"unknown key{hint} (allowed: {', '.join(allowed)})", ""
-    if kind == "missing":
-        return where, "is missing", _about(keys, models)
-    if kind == "union_tag_not_found":
-        return where, f"needs kind = {_kinds(keys)}", ""
-    if kind == "union_tag_invalid":
-        return f'{where}.kind = "{problem["ctx"]["tag"]}"', f"must be {_kinds(keys)}", ""
-    said = problem["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("should", "must")
-    said = said.replace("valid tuple", "list").replace("valid list", "list").replace("valid dictionary", "table")
-    value = "" if isinstance(problem["input"], BaseModel) or not keys else f" = {found}"
-    return where + value, said, _about(keys, models)
+def load_right_part(path: str | Path) -> RightPart:
+    """What can be judged of a scene file in spite of what is wrong in it.
+
+    Raises SceneError where the file is missing or not in its format.
+    """
+    file, data = _tables(path)
+    lists = {name: data[name] for name in LISTS if isinstance(data.get(name), list)}
+    part = RightPart(None, [], set(), {name: list(range(len(tables))) for name, tables in lists.items()})
+    for _ in range(100):  # each round leaves something out, and few rounds find something new
+        try:
+            part.scene = Scene.model_validate(data, context={"folder": file.parent})
+            part.left_out -= {placed.name for placed in (*part.scene.bodies, *part.scene.obstacles)}
+            return part
+        except ValidationError as error:
+            part.problems += [line for line in explain(error, data, Scene) if line not in part.problems]
+            data = _without_wrong(error, data, part)
+            if not data.get("bodies"):
+                break
+    return part
 
 
-def _kinds(keys: list[str | int]) -> str:
-    return '"solid" or "cloth"' if keys[0] == "bodies" else '"wind" or "vertices"'
-
-
-def _about(keys: list[str | int], models: list[type[BaseModel]]) -> str:
-    for model in models:
-        field = model.model_fields.get(str(keys[-1])) if keys else None
-        if field is not None and field.description:
-            return f" ({field.description})"
-    return ""
-
-
-def _follow(loc: tuple[str | int, ...], data: Any) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """The keys of `loc` without the tags that pydantic puts in for unions, and the models that may hold the last key."""
-    keys: list[str | int] = []
-    models: list[type[BaseModel]] = [Scene]
-    holders = models
-    for part in loc:
-        known = any(part in model.model_fields for model in models)
-        if not (known or isinstance(part, int) or (isinstance(data, dict) and part in data)):
-            models = [model for model in models if part in _tags(model)] or models
-            continue
-        keys.append(part)
-        if isinstance(part, str):
-            holders = models
-            models = [
-                found
-                for model in models
-                if part in model.model_fields
-                for found in _models(model.model_fields[part].annotation)
-            ]
-        data = _get(data, part)
-    return keys, holders
-
-
-def _get(data: Any, key: str | int) -> Any:
+def _tables(path: str | Path) -> tuple[Path, dict[str, Any]]:
+    """The file that a path or name means, and its tables. Raises SceneError."""
+    file = bundled_scenes().get(str(path), Path(path))
+    if not is_file(file):
+        near = difflib.get_close_matches(str(path), bundled_scenes(), n=1)
+        hint = f'did you mean "{near[0]}"? ' if near else ""
+        raise SceneError(f'"{clipped(str(path))}": there is no such file; {hint}bundled scenes: {", ".join(bundled_scenes())}')
+    kind = file.suffix[1:].upper()
+    if file.suffix not in (".toml", ".json"):
+        raise SceneError(f'"{file}": a scene file ends in .toml or .json')
     try:
-        return data[key]
-    except (KeyError, IndexError, TypeError):
-        return None
+        needed, free = BYTES_PER_BYTE * file.stat().st_size, free_memory()
+        if needed > free:
+            raise SceneError(
+                f'"{file}": needs about {gib(needed)} of memory, and {gib(free)} are free; put meshes in .npz files'
+            )
+        text = file.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
+        data = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+    except RecursionError as error:
+        raise SceneError(f'"{file}": is not valid {kind}: its tables or lists are nested too deep') from error
+    except SceneError:
+        raise
+    except (ValueError, OSError, MemoryError) as error:
+        said = "it needs more memory than there is" if isinstance(error, MemoryError) else str(error)
+        raise SceneError(f'"{file}": is not valid {kind}: {said}') from error
+    if not isinstance(data, dict):
+        raise SceneError(f'"{file}": holds a {type(data).__name__}; a scene is a table: {{"bodies": [...]}}')
+    return file, data
 
 
-def _tags(model: type[BaseModel]) -> set[Any]:
-    return {model.__name__.lower()} | {
-        model.model_fields[name].default for name in ("kind", "shape") if name in model.model_fields
-    }
-
-
-def _models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in typing.get_args(annotation) for model in _models(part)]
-
-
-def _path(keys: list[str | int], data: Any) -> str:
-    text = ""
-    for key in keys:
-        data = _get(data, key)
-        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else key
-        if isinstance(key, int) and isinstance(data, dict) and isinstance(data.get("name"), str):
-            text += f' ("{data["name"]}")'
-    return text or "the scene"
-
-
-def _short(value: Any) -> str:
-    text = f'"{value}"' if isinstance(value, str) else str(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+def _without_wrong(error: ValidationError, data: dict[str, Any], part: RightPart) -> dict[str, Any]:
+    """The tables without what `error` finds wrong; notes in `part` what was left out."""
+    data = {key: dict(value) if isinstance(value, dict) else value for key, value in data.items()}
+    wrong: dict[str, set[int]] = {}
+    for problem in error.errors(include_url=False):
+        keys, _ = follow(problem["loc"], data, Scene)
+        match keys:
+            case [str(name), int(number), *_] if name in part.numbers:
+                wrong.setdefault(name, set()).add(number)
+            case [("simulation" | "contact") as name, str(key), *_] if isinstance(data.get(name), dict):
+                data[name].pop(key, None)
+            case [str(name), *_]:
+                data.pop(name, None)
+                part.numbers.pop(name, None)
+            case _:  # names that are there more than once: the first of each stays
+                seen: set[str] = set()
+                for name in ("bodies", "obstacles"):
+                    for number, table in enumerate(data.get(name) or []):
+                        wrong.setdefault(name, set()).update([number] if table["name"] in seen else [])
+                        seen.add(table["name"])
+    for name, numbers in wrong.items():
+        if name in ("bodies", "obstacles"):
+            part.left_out |= {str(data[name][k].get("name")) for k in numbers if isinstance(data[name][k], dict)}
+        data[name] = [table for number, table in enumerate(data[name]) if number not in numbers]
+        part.numbers[name] = [place for number, place in enumerate(part.numbers[name]) if number not in numbers]
+    return data

@@ -2,18 +2,24 @@
 
 import contextlib
 import importlib.util
-import io
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pdipc.scene import files
+from pdipc.scene.cells import CELL_FACES, tetrahedra, triangulate
 from pdipc.scene.errors import SceneError
+from pdipc.scene.files.contents import CORNERS, Contents, lines_left_out
+from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
 TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
 SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", ".usd", ".usda", ".usdc")
+FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # outward for a tet of positive volume
 
 
@@ -27,16 +33,18 @@ class Mesh:
 
     vertices: (n, 3) float64, m. triangles: (m, 3) int32, the boundary of the tets where there are any, outward.
     tets: (t, 4) int32, of positive volume: (v1 - v0) x (v2 - v0) . (v3 - v0) > 0.
+    notes: what was left out of the file, or converted, a sentence each.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     tets: np.ndarray = field(default_factory=_no_tets)
+    notes: list[str] = field(default_factory=list)
 
     def surface(self) -> "Mesh":
         """The triangles alone, with only the vertices that they use."""
         used, triangles = np.unique(self.triangles, return_inverse=True)
-        return Mesh(self.vertices[used], triangles.reshape(-1, 3).astype(np.int32))
+        return Mesh(self.vertices[used], triangles.reshape(-1, 3).astype(np.int32), notes=self.notes)
 
     @staticmethod
     def of_tets(vertices: np.ndarray, tets: np.ndarray) -> "Mesh":
@@ -65,6 +73,37 @@ def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
+def longest_edges(vertices: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """(m,) lengths of the longest edge of each of elements (m, k), m."""
+    corners = vertices[elements]
+    return np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
+
+
+def flat_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(m,) bool: which triangles have no area to speak of."""
+    return triangle_areas(vertices, triangles) <= FLAT * longest_edges(vertices, triangles) ** 2
+
+
+def without_useless(mesh: Mesh, where: str) -> Mesh:
+    """A surface without the triangles that bound nothing: those without area, and repetitions of others; its notes say so.
+
+    Raises SceneError where none is left.
+    """
+    notes, triangles = list(mesh.notes), mesh.triangles
+    with np.errstate(over="ignore", invalid="ignore"):
+        flat = flat_triangles(mesh.vertices, triangles)
+    if flat.any():
+        notes.append(f"{np.count_nonzero(flat)} triangles without an area were left out")
+        triangles = triangles[~flat]
+    if not len(triangles):
+        raise SceneError(f"{where}: none of its {len(flat)} triangles has an area")
+    once = np.sort(np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1])
+    if len(once) < len(triangles):
+        notes.append(f"{len(triangles) - len(once)} triangles that were there more than once were left out")
+        triangles = triangles[once]
+    return Mesh(mesh.vertices, triangles, notes=notes)
+
+
 def center_of_mass(mesh: Mesh) -> np.ndarray:
     """Centroid of the tets, else of the triangles, of uniform density, m."""
     elements = mesh.tets if len(mesh.tets) else mesh.triangles
@@ -83,33 +122,187 @@ def locate(name: str) -> Path:
     return Path(spec.origin).parent / "examples" / "assets" / name.removeprefix("warp:")
 
 
-def read(name: str | Path) -> Mesh:
-    """Reads a mesh file; see `SUFFIXES` for the formats.
+def read(name: str | Path, worker: Worker | None = None) -> Mesh:
+    """Reads a mesh file; see `SUFFIXES` for the formats. What it leaves out of the file is in the mesh's `notes`.
 
+    worker: reads what other packages parse; None starts one where it is needed.
     Raises SceneError where the file is missing, has another format, cannot be read, or holds neither triangles nor tets.
     """
     path = locate(str(name))
+    return guarded(path, lambda: from_contents(contents(path, worker), f'mesh file "{path}"'))
+
+
+def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> Contents:
+    """What a mesh file holds, before it is cut; frames: with all frames. Raises SceneError as `read` does."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise SceneError(f'mesh file "{path}": the format "{suffix}" is not known; allowed: {" ".join(SUFFIXES)}')
-    if not path.is_file():
-        raise SceneError(f'mesh file "{path}": there is no such file')
+        raise SceneError(
+            f'mesh file "{_short(path)}": the format "{_short(suffix)}" is not known; allowed: {" ".join(SUFFIXES)}'
+        )
+    if not is_file(path):
+        raise SceneError(f'mesh file "{_short(path)}": there is no such file')
+
+    def read() -> Contents:
+        if not files.is_foreign(path):
+            return files.parse(path, frames)
+        with contextlib.nullcontext(worker) if worker else Worker() as reader:
+            return reader.read(path, frames)
+
+    return guarded(path, read)
+
+
+def guarded(path: Path, reading: Callable[[], Any]) -> Any:
+    """What `reading` a file gives. Raises SceneError in place of whatever a damaged file leads to."""
     try:
-        if suffix == ".npz":
-            vertices, tets, triangles = _read_npz(path)
-        elif suffix in (".node", ".ele"):
-            vertices, tets, triangles = _read_tetgen(path)
-        elif suffix.startswith(".usd"):
-            vertices, tets, triangles = _read_usd(path)
-        elif suffix in TET_SUFFIXES:
-            vertices, tets, triangles = _read_meshio(path)
-        else:
-            vertices, tets, triangles = _read_trimesh(path)
+        return reading()
     except SceneError:
         raise
     except Exception as error:
-        raise SceneError(f'mesh file "{path}": cannot be read as {suffix}: {error}') from error
-    return from_arrays(vertices, tets, triangles, f'mesh file "{path}"')
+        raise SceneError(failed(path, error)) from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False also for names that no file can have, and links that go round in circles."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError, RuntimeError):
+        return False
+
+
+def _short(text: object) -> str:
+    return str(text) if len(str(text)) <= 300 else f"{str(text)[:300]}..."
+
+
+def from_contents(contents: Contents, where: str, whole: bool = False) -> Mesh:
+    """A mesh of what a file holds: its cells cut into tets, else its polygons cut into triangles, and a note for what is left out.
+
+    whole: with all vertices of the file in their order, as frames have them; else only those that are used, and each place once.
+    Raises SceneError where it holds neither.
+    """
+    notes = list(contents.notes)
+    if contents.frames is not None and not whole:
+        notes.append(f"it holds {len(contents.frames)} frames: the first was taken")
+    points = np.asarray(contents.points, dtype=np.float64)
+    if points.ndim == 2 and points.shape[1] < 3:
+        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))  # what is flat lies in the plane of x and y
+    blocks: dict[str, list[np.ndarray]] = {kind: [] for kind in CORNERS}
+    higher: dict[str, int] = {}
+    for kind, rows in contents.cells:
+        corners = CORNERS[kind]
+        if rows.ndim != 2 or rows.shape[1] < corners:
+            name = {"tetra": "tets", "triangle": "triangles"}.get(kind, kind)
+            raise SceneError(f"{where}: {name} have the shape {rows.shape}; they must be (m, {corners})")
+        if rows.shape[1] > corners and len(rows):
+            higher[kind] = higher.get(kind, 0) + len(rows)
+        blocks[kind].append(rows[:, :corners])
+    if higher:
+        listed = ", ".join(f"{count} {kind}" for kind, count in higher.items())
+        notes.append(f"cells of higher order were reduced to their corners: {listed}")
+    for kind, given in blocks.items():
+        for rows in given:
+            name = {"tetra": "tets", "triangle": "triangles"}.get(kind, kind)
+            check_indices(rows, len(points), name, where)
+    cells = {kind: np.concatenate(given).astype(np.int64) for kind, given in blocks.items() if sum(map(len, given))}
+    corners, counts = contents.polygons
+    if len(corners) and (corners.min() < 0 or corners.max() >= len(points)):
+        worst = int(corners[(corners < 0) | (corners >= len(points))][0])
+        raise SceneError(f"{where}: a face names vertex {worst}, which is out of range; indices must be 0 to {len(points) - 1}")
+    solids = [_tets(points, kind, cells[kind]) for kind in CELL_FACES if kind in cells]
+    faces = [(corners, counts)]
+    for kind, size in (("triangle", 3), ("quad", 4)):
+        if kind in cells:
+            faces.append((cells[kind].ravel(), np.full(len(cells[kind]), size)))
+    corners, counts = (np.concatenate(parts) for parts in zip(*faces, strict=True))
+    lines = np.sort(cells.get("line", np.zeros((0, 2), dtype=np.int64)), axis=1)
+    if solids:
+        loose = _not_among(_rings(corners, counts), _cell_faces(cells))
+        if loose:
+            notes.append(f"{loose} faces that bound no cell were left out")
+        tets = np.concatenate(solids)
+        kept = np.unique(np.sort(tets, axis=1), axis=0, return_index=True)[1]
+        if len(kept) < len(tets):
+            notes.append(f"{len(tets) - len(kept)} tets that were there twice were left out")
+            tets = tets[np.sort(kept)]
+        notes += _lines(lines, tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]])
+        return replace(from_arrays(points, tets, None, where, drop_unused=not whole), notes=notes)
+    small = counts < 3
+    if small.any():
+        notes.append(f"{np.count_nonzero(small)} faces of fewer than three corners were left out")
+        corners, counts = corners[np.repeat(~small, counts)], counts[~small]
+    triangles, crossed = triangulate(points, corners, counts)
+    if crossed:
+        notes.append(f"{crossed} polygons cross themselves, so that no way to cut them is right")
+    if not len(triangles):
+        others = ", ".join(kind for kind in cells) or "none"
+        raise SceneError(f"{where}: holds no triangles: cells of the kinds {others}; needed: tetra or other cells, or faces")
+    notes += _lines(lines, triangles[:, [[0, 1], [1, 2], [2, 0]]])
+    points, merged = (points, None) if whole else _merge(points)
+    if merged is not None:
+        triangles = merged[triangles]
+        if not contents.repeats:
+            notes.append(f"{len(merged) - len(points)} vertices that lie exactly on others were merged with them")
+    flat = np.any(triangles == triangles[:, [1, 2, 0]], axis=1)
+    if flat.any() and not flat.all():
+        notes.append(f"{np.count_nonzero(flat)} triangles that have a corner twice were left out")
+        triangles = triangles[~flat]
+    return replace(from_arrays(points, None, triangles, where, drop_unused=not whole), notes=notes)
+
+
+def _tets(points: np.ndarray, kind: str, cells: np.ndarray) -> np.ndarray:
+    """(t, 4) tets of cells of one kind; a kind whose cells are all turned inside out is another convention, and is turned."""
+    tets = tetrahedra(kind, cells)
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = len(tets) > 0 and np.all(tet_volumes(points, tets) <= 0)
+    return tets[:, [0, 2, 1, 3]] if turned else tets
+
+
+def _cell_faces(cells: dict[str, np.ndarray]) -> np.ndarray:
+    """(f, 4) sorted vertices of the faces of all cells that have a volume; -1 stands before those of a triangle."""
+    rings = [
+        _rings(cells[kind][:, face].ravel(), np.full(len(cells[kind]), len(face)))
+        for kind in CELL_FACES
+        if kind in cells
+        for face in CELL_FACES[kind]
+    ]
+    return np.concatenate(rings)
+
+
+def _rings(corners: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(p, w) sorted vertices of polygons, w at least 4; -1 stands before those of polygons with fewer corners."""
+    table = np.full((len(counts), max(4, counts.max(initial=0))), -1, dtype=np.int64)
+    first = np.cumsum(counts) - counts
+    rows = np.repeat(np.arange(len(counts)), counts)
+    table[rows, np.arange(len(corners)) - np.repeat(first, counts)] = corners
+    return np.sort(table, axis=1)
+
+
+def _not_among(rows: np.ndarray, known: np.ndarray) -> int:
+    """How many of the rows (p, w) are not among the rows of `known` (q, 4)."""
+    if rows.shape[1] > known.shape[1]:
+        known = np.pad(known, ((0, 0), (rows.shape[1] - known.shape[1], 0)), constant_values=-1)
+    _, number = np.unique(np.concatenate([known, rows]), axis=0, return_inverse=True)
+    number = number.ravel()
+    return int(np.count_nonzero(~np.isin(number[len(known) :], number[: len(known)])))
+
+
+def _lines(lines: np.ndarray, edges: np.ndarray) -> list[str]:
+    if not len(lines):
+        return []
+    edges = np.sort(edges.reshape(-1, 2), axis=1)
+    _, number = np.unique(np.concatenate([edges, lines]), axis=0, return_inverse=True)
+    loose = int(np.count_nonzero(~np.isin(number.ravel()[len(edges) :], number.ravel()[: len(edges)])))
+    return [lines_left_out(loose)] if loose else []
+
+
+def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """The points without those that lie exactly on an earlier one, and the new number of each; None where all differ."""
+    _, first, number = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)  # + 0.0: -0.0 is 0.0
+    if len(first) == len(points):
+        return points, None
+    order = np.argsort(first)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[order] = np.arange(len(first))
+    return points[first[order]], rank[number.ravel()]
 
 
 def from_arrays(
@@ -131,14 +324,7 @@ def from_arrays(
         raise SceneError(f"{where}: holds neither triangles nor tetrahedra")
     if elements.ndim != 2 or elements.shape[1] != width:
         raise SceneError(f"{where}: {kind} have the shape {elements.shape}; they must be (m, {width})")
-    if elements.dtype.kind not in "iuf" or not np.all(elements == np.floor(elements)):
-        raise SceneError(f"{where}: {kind} must be whole numbers")
-    elements = elements.astype(np.int64)
-    if elements.min() < 0 or elements.max() >= len(vertices):
-        row = int(np.flatnonzero(((elements < 0) | (elements >= len(vertices))).any(axis=1))[0])
-        raise SceneError(
-            f"{where}: {kind}[{row}] = {elements[row].tolist()} is out of range; indices must be 0 to {len(vertices) - 1}"
-        )
+    check_indices(elements, len(vertices), kind, where)
     elements = elements.astype(np.int32)
     if kind == "triangles":
         mesh = Mesh(vertices, elements)
@@ -148,80 +334,15 @@ def from_arrays(
     return Mesh.of_tets(vertices, elements) if drop_unused else Mesh(vertices, boundary(elements), elements)
 
 
-def _read_npz(path: Path):
-    with np.load(path) as data:
-        if "V" not in data:
-            raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets) or F (triangles)')
-        return data["V"], data.get("T"), data.get("F")
-
-
-def _read_meshio(path: Path):
-    import meshio
-
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            mesh = meshio.read(path)
-    except SystemExit as error:  # meshio prints what is wrong and ends the process on some files
-        raise ValueError(" ".join(said.getvalue().split())) from error
-    cells = mesh.cells_dict
-    if not {"tetra", "triangle"} & set(cells):
-        raise SceneError(
-            f'mesh file "{path}": holds cells of the kinds {", ".join(cells) or "none"}; needed: tetra (of four vertices) or triangle'
-        )
-    return _three(mesh.points), cells.get("tetra"), cells.get("triangle")
-
-
-def _three(points: np.ndarray) -> np.ndarray:
-    return points if points.shape[1] == 3 else np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-
-
-def _read_trimesh(path: Path):
-    import trimesh
-
-    # merge_norm and merge_tex: a mesh cut along seams of its normals or textures is one surface here
-    mesh = trimesh.load(path, force="mesh", process=False)
-    if len(mesh.faces) == 0:
-        raise SceneError(f'mesh file "{path}": holds no triangles')
-    if np.isfinite(mesh.vertices).all() and mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices):
-        mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    return mesh.vertices, None, mesh.faces
-
-
-def _read_tetgen(path: Path):
-    def rows(file: Path) -> np.ndarray:
-        if not file.is_file():
-            raise SceneError(f'mesh file "{path}": needs "{file.name}" beside it')
-        lines = [line.split("#")[0].split() for line in file.read_text().splitlines()]
-        lines = [line for line in lines if line]
-        count = int(lines[0][0])
-        if len(lines) <= count:
-            raise SceneError(f'mesh file "{file}": its first line says {count} rows, and {len(lines) - 1} are there')
-        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]])
-
-    nodes, elements = rows(path.with_suffix(".node")), rows(path.with_suffix(".ele"))
-    return nodes[:, 1:4], elements[:, 1:5] - nodes[0, 0], None
-
-
-def _read_usd(path: Path):
-    try:
-        from pxr import Usd
-    except ImportError as error:
-        raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
-    stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
-    for prim in stage.Traverse():
-        if prim.GetTypeName() != "Mesh":
-            continue
-        points = np.array(prim.GetAttribute("points").Get(), dtype=np.float64)
-        tets = prim.GetAttribute("tetraIndices")
-        if tets and tets.HasValue():
-            return points, np.array(tets.Get()).reshape(-1, 4), None
-        counts = np.array(prim.GetAttribute("faceVertexCounts").Get())
-        corners = np.array(prim.GetAttribute("faceVertexIndices").Get())
-        first = np.cumsum(counts) - counts
-        fans = [first[counts > k + 1, None] + np.array([0, k, k + 1]) for k in range(1, int(counts.max()) - 1)]
-        return points, None, corners[np.concatenate(fans)]
-    raise SceneError(f'mesh file "{path}": holds no Mesh')
+def check_indices(elements: np.ndarray, count: int, kind: str, where: str) -> None:
+    """Raises SceneError where elements (m, k) are not whole numbers from 0 to count - 1."""
+    if elements.dtype.kind not in "iuf" or not np.all(elements == np.floor(elements)):
+        raise SceneError(f"{where}: {kind} must be whole numbers")
+    outside = ((elements < 0) | (elements >= count)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        found = [int(index) for index in elements[row]]
+        raise SceneError(f"{where}: {kind}[{row}] = {found} is out of range; indices must be 0 to {count - 1}")
 
 
 def tetrahedralize(mesh: Mesh, where: str) -> Mesh:

@@ -1,10 +1,11 @@
-"""Where scripted points are at a time: rigid motions relative to the start."""
+"""Where scripted points are at a time: rigid motions relative to the start, and obstacles that deform."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from pdipc.scene.frames import Frames
 from pdipc.scene.schema import Motion
 
 
@@ -25,8 +26,11 @@ class Trajectory:
         self.center = np.asarray(center if self.motion.center is None else self.motion.center, dtype=np.float64)
         self._times = np.array([keyframe.time for keyframe in self.motion.keyframes])
         self._translations = np.array([keyframe.translation for keyframe in self.motion.keyframes])
-        rotations = [keyframe.rotation for keyframe in self.motion.keyframes]
-        self._turn = Slerp(self._times, Rotation.from_euler("xyz", rotations, degrees=True)) if len(rotations) > 1 else None
+        self._angles = np.array([keyframe.rotation for keyframe in self.motion.keyframes])
+        shortest = self.motion.turns == "shortest" and len(self._angles) > 1
+        self._turn = Slerp(self._times, Rotation.from_euler("xyz", self._angles, degrees=True)) if shortest else None
+
+    is_rigid = True
 
     @property
     def is_static(self) -> bool:
@@ -42,17 +46,43 @@ class Trajectory:
             passed = max(0.0, (time if m.end is None else min(time, m.end)) - m.start)
             return Rotation.from_rotvec(passed * np.array(m.angular_velocity)).as_matrix(), passed * np.array(m.velocity)
         time = float(np.clip(time, self._times[0], self._times[-1]))
-        if self._turn is None:
-            return rotation_matrix(m.keyframes[0].rotation), self._translations[0]
-        if m.smooth:
+        if m.smooth and len(self._times) > 1:
             after = int(np.clip(np.searchsorted(self._times, time), 1, len(self._times) - 1))
             first, last = self._times[after - 1 : after + 1]
             part = (time - first) / (last - first)
             time = float(np.clip(first + (last - first) * part * part * (3 - 2 * part), first, last))
-        p = np.array([np.interp(time, self._times, column) for column in self._translations.T])
-        return self._turn(time).as_matrix(), p
+        p, angles = (
+            np.array([np.interp(time, self._times, column) for column in table.T])
+            for table in (self._translations, self._angles)
+        )
+        return rotation_matrix(angles) if self._turn is None else self._turn(time).as_matrix(), p
 
     def apply(self, points: np.ndarray, time: float) -> np.ndarray:
         """(n, 3) points of the start, m, at `time` s."""
         rotation, p = self.pose(time)
         return (points - self.center) @ rotation.T + (self.center + p)
+
+
+class Deforming:
+    """All vertices of an obstacle over time: on straight lines from frame to frame, then placed as the obstacle is."""
+
+    is_rigid = False
+
+    def __init__(self, frames: Frames, begin: float, matrix: np.ndarray, translation: Sequence[float]):
+        """begin: when the first frame is there, s. A vertex of the cache is at matrix (3, 3) vertex + translation (3,), m."""
+        self.frames, self.begin, self.matrix, self.translation = frames, begin, matrix, translation
+
+    @property
+    def is_static(self) -> bool:
+        """Whether all frames are alike."""
+        points = self.frames.points
+        return all(np.array_equal(points[0], frame) for frame in points[1:])
+
+    def apply(self, points: np.ndarray | None, time: float) -> np.ndarray:
+        """(n, 3) vertices, m, at `time` s. points: (n, 3) of the start, which says nothing more."""
+        times = self.frames.times
+        time = float(np.clip(time - self.begin, 0.0, times[-1]))
+        after = int(np.clip(np.searchsorted(times, time), 1, max(1, len(times) - 1)))
+        first, last = self.frames.points[after - 1].astype(np.float64), self.frames.points[min(after, len(times) - 1)]
+        part = (time - times[after - 1]) / (times[after] - times[after - 1]) if len(times) > 1 else 0.0
+        return (first + part * (last - first)) @ self.matrix.T + self.translation

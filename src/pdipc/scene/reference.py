@@ -18,7 +18,7 @@ SECTIONS = {
     "Simulation and contact": (schema.Simulation, schema.Contact),
     "Bodies": (schema.Solid, schema.SolidMaterial, schema.Cloth, schema.ClothMaterial, schema.Copies),
     "Pins, selections, attachments": (schema.Pin, schema.Selection, schema.Attachment),
-    "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe),
+    "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe, schema.Deformation, schema.FrameArrays),
     "Forces": (schema.Wind, schema.VertexForce),
     "Shapes and arrays": (*generators.SHAPES, schema.Arrays),
 }
@@ -51,7 +51,15 @@ A mesh is one of
 - arrays, `{{ vertices = [...], tets = [...] }}`: in Python, NumPy arrays.
 
 A solid takes a mesh's tets; cloth and obstacles take its triangles, which for a mesh of tets are its surface. A closed obstacle
-whose triangles face outward is solid, so nothing may start inside it; one that faces inward is a container.
+whose triangles face outward is solid, so nothing may start inside it; one that faces inward is a container. Bodies must be
+manifolds; obstacles need not be, and lose triangles without area or that repeat others.
+
+Quads and polygons, concave ones too, are cut into triangles, and hexahedra, wedges and pyramids into tets, alike on both sides of
+a face. Cells of higher order are reduced to their corners. All meshes of a USD stage are read, where they stand, in its unit and
+with its upward axis turned to y; other formats know no unit: their numbers are metres. What is left out of a file or converted
+is said by `pdipc run` and `pdipc check-scene`, and in Python by a SceneWarning.
+
+An obstacle may deform: `motion = {{ cache = "dance.npz", frame_rate = 25 }}`, see [Deformation](#deformation).
 
 A vertex of the mesh starts at translation + R (scale * vertex). Distances that a scene leaves open follow from its size L, the
 diagonal of the bounding box of all bodies at the start: the activation distance is 1e-3 L, the minimum separation 0.02 of that.

@@ -12,27 +12,34 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     PlainSerializer,
+    StrictBool,
     Tag,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 
 from pdipc.scene import generators
+from pdipc.scene.explain import short
+from pdipc.scene.tables import Real, Table, Whole
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+SHORTEST_STEP = 1e-9  # s
+
+Number = Annotated[Real, Field(allow_inf_nan=False)]
+Positive = Annotated[Real, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[Real, Field(ge=0, allow_inf_nan=False)]
+Index = Annotated[Whole, Field(ge=0)]
+Count = Annotated[Whole, Field(ge=1, le=10**9)]
 Vector = tuple[Number, Number, Number]
 
 
-class Table(BaseModel):
-    """What all tables share: unknown keys are refused, also on assignment from Python."""
-
-    model_config = ConfigDict(extra="forbid", validate_assignment=True, arbitrary_types_allowed=True)
+def _no_instant(seconds: float) -> float:
+    if seconds < SHORTEST_STEP:
+        raise ValueError(f"must be at least {SHORTEST_STEP:g} s: 1 / h^2 has to be a number")
+    return seconds
 
 
 def _exactly_one(table: BaseModel, *names: str) -> None:
@@ -47,9 +54,11 @@ def _exactly_one(table: BaseModel, *names: str) -> None:
 class Simulation(Table):
     """How time advances."""
 
-    time_step: Positive = Field(default=0.01, le=1.0, description="Length h of a step, s.")
-    steps: int = Field(default=200, ge=0, description="Number of steps of a run.")
-    substeps: int = Field(default=1, ge=1, le=1000, description="Solves in a step, each of h / substeps.")
+    time_step: Annotated[Positive, AfterValidator(_no_instant)] = Field(
+        default=0.01, le=1.0, description="Length h of a step, s."
+    )
+    steps: Whole = Field(default=200, ge=0, description="Number of steps of a run.")
+    substeps: Whole = Field(default=1, ge=1, le=1000, description="Solves in a step, each of h / substeps.")
     gravity: Vector = Field(default=(0.0, -9.81, 0.0), description="Acceleration of every body, m/s^2.")
     damping: NotNegative = Field(
         default=0.0,
@@ -76,24 +85,26 @@ class Simulation(Table):
         description='How the nonlinear problem of a step is solved; "auto" is newton, unless a setting of local-global '
         "(inner_iterations, linear_solver, linear_iterations, linear_tolerance, solver_order, solver_drop) is given.",
     )
-    max_outer: int = Field(
+    max_outer: Whole = Field(
         default=50,
         ge=1,
         le=10**6,
         description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
     )
-    inner_iterations: int = Field(default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration.")
+    inner_iterations: Whole = Field(
+        default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration."
+    )
     linear_solver: Literal[
         "auto", "pcg", "two-level", "jacobi", "chebyshev", "a-jacobi", "matrix-powers", "gauss-seidel", "sor", "direct"
     ] = Field(
         default="auto",
         description='Solver of the global step; "auto": two-level (on CUDA pcg), with the paper\'s contact a-jacobi.',
     )
-    linear_iterations: int = Field(default=20, ge=1, le=10**5, description="Most iterations of a global solve.")
+    linear_iterations: Whole = Field(default=20, ge=1, le=10**5, description="Most iterations of a global solve.")
     linear_tolerance: Positive = Field(
         default=1e-2, lt=1.0, description="A global solve ends when its residual has fallen to this part of the first."
     )
-    solver_order: int = Field(default=2, ge=1, le=3, description="Sweeps that a-jacobi and matrix-powers take in one.")
+    solver_order: Whole = Field(default=2, ge=1, le=3, description="Sweeps that a-jacobi and matrix-powers take in one.")
     solver_drop: NotNegative = Field(
         default=0.0,
         lt=1.0,
@@ -136,7 +147,7 @@ class Contact(Table):
         description='"global" cuts the whole step at the first impact, as the paper does; "per_vertex" only where it happens; '
         '"auto": as the method does.',
     )
-    restitution: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
+    restitution: Annotated[Real, Field(ge=0.0, le=1.0)] | None = Field(
         default=None,
         description="Part of the speed of approach that surfaces part with after an impact (eps of Eq. 6). Absent: what the barrier "
         "gives back, 0 to 0.1 for most impacts and steps; with the paper's method 0.",
@@ -147,21 +158,67 @@ class Contact(Table):
 
 
 def _rows(dtype: type, width: int) -> BeforeValidator:
+    kinds, needed = ("iu", "whole numbers") if dtype is np.int64 else ("iuf", "numbers")
+
     def read(value: Any) -> np.ndarray:
-        array = np.array(value, dtype=None if dtype is np.int64 else dtype)
-        if array.size and dtype is np.int64 and array.dtype.kind not in "iu":
-            raise ValueError("must be whole numbers")
+        if not isinstance(value, np.ndarray):
+            _refuse_other_than_numbers(value, width, needed)
+        try:
+            array = np.asarray(value, dtype=None if isinstance(value, np.ndarray) or dtype is np.int64 else dtype)
+        except (OverflowError, ValueError) as error:
+            raise ValueError(f"must be {needed} that 64 bits hold: {error}") from None
+        if array.size and array.dtype.kind not in kinds:
+            raise ValueError(f"must be {needed}; is an array of {array.dtype}")
         if array.size and (array.ndim != 2 or array.shape[1] != width):
             raise ValueError(f"has the shape {array.shape}; must be (n, {width})")
+        if dtype is np.int64 and array.size and array.max() > np.iinfo(np.int64).max:
+            raise ValueError("must be whole numbers that 64 bits hold")
         return array.reshape(-1, width).astype(dtype)
 
     return BeforeValidator(read)
 
 
+def _refuse_other_than_numbers(value: Any, width: int, needed: str) -> None:
+    """Raises ValueError, with the place, where a list holds what is no number: NumPy would take text and truth values for some."""
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"must be a list of lists of {width} {needed}")
+    for row, cells in enumerate(value):
+        if not isinstance(cells, list | tuple) and not (isinstance(cells, np.ndarray) and cells.ndim == 1):
+            raise ValueError(f"must be a list of lists of {width} {needed}; [{row}] is {short(cells)}")
+        for column, cell in enumerate(cells):
+            if type(cell) is not float and type(cell) is not int and not isinstance(cell, np.integer | np.floating):
+                raise ValueError(f"must be {needed}; [{row}][{column}] is {short(cell)}")
+
+
+def _rows_schema(kind: str, width: int) -> WithJsonSchema:
+    row = {"type": "array", "items": {"type": kind}, "minItems": width, "maxItems": width}
+    return WithJsonSchema({"type": "array", "items": row})
+
+
 _AS_LIST = PlainSerializer(lambda array: array.tolist(), return_type=list)
-Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST]
-Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST]
-Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST]
+Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST, _rows_schema("number", 3)]
+Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST, _rows_schema("integer", 3)]
+Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST, _rows_schema("integer", 4)]
+
+
+_FRAMES_SCHEMA = WithJsonSchema({"type": "array", "items": _rows_schema("number", 3).json_schema})
+
+
+def _frames(value: Any) -> np.ndarray:
+    """(f, n, 3) numbers, in Python an array, in files lists."""
+    if not isinstance(value, np.ndarray):
+        if not isinstance(value, list | tuple):
+            raise ValueError("must be a list of frames, each a list of lists of 3 numbers")
+        for frame in value:
+            if not isinstance(frame, np.ndarray):
+                _refuse_other_than_numbers(frame, 3, "numbers")
+        try:
+            value = np.asarray(value, dtype=np.float64)
+        except (OverflowError, ValueError, TypeError) as error:
+            raise ValueError(f"must be numbers that 64 bits hold, and each frame of as many vertices: {error}") from None
+    if value.dtype.kind not in "iuf" or value.ndim != 3 or value.shape[2] != 3:
+        raise ValueError(f"has the shape {value.shape} and is {value.dtype}; must be numbers (f, n, 3)")
+    return value
 
 
 class Arrays(Table):
@@ -189,7 +246,12 @@ class Arrays(Table):
 def _resolve(path: str, info: ValidationInfo) -> str:
     """A path in a scene file is relative to the file."""
     folder = (info.context or {}).get("folder")
-    return path if folder is None or path.startswith("warp:") else str((Path(folder) / path).resolve())
+    if folder is None or path.startswith("warp:"):
+        return path
+    try:
+        return str((Path(folder) / path).resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # links in circles, names that are too long
+        raise ValueError(f"is no path to a file: {error}") from None
 
 
 def _mesh_kind(value: Any) -> str | None:
@@ -228,7 +290,7 @@ MeshSource = Annotated[
 class Placed(Table):
     """A mesh, and where it stands: x = translation + R (scale * vertex)."""
 
-    name: str = Field(min_length=1, description="Name, unique in the scene.")
+    name: str = Field(min_length=1, max_length=200, description="Name, unique in the scene.")
     mesh: MeshSource = Field(
         description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp), a shape, or arrays."
     )
@@ -257,7 +319,7 @@ class SolidMaterial(Table):
 
     density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
     young_modulus: Positive = Field(default=1e5, le=1e12, description="Young's modulus, Pa.")
-    poisson_ratio: float = Field(default=0.4, ge=0, le=0.499, description="Poisson's ratio.")
+    poisson_ratio: Real = Field(default=0.4, ge=0, le=0.499, description="Poisson's ratio.")
     model: Literal["arap", "corotated", "neo_hookean"] = Field(
         default="arap",
         description="The elastic energy; all are Hooke's law for small strains. arap: the paper's constraints of strain and volume; "
@@ -276,7 +338,7 @@ class ClothMaterial(Table):
     membrane_stiffness: Positive | None = Field(
         default=None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
     )
-    poisson_ratio: float = Field(default=0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
+    poisson_ratio: Real = Field(default=0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
     bending_stiffness: NotNegative | None = Field(
         default=None,
         le=1e6,
@@ -325,9 +387,14 @@ class Motion(Table):
 
     keyframes: list[Keyframe] = Field(
         default=[],
-        description="Poses in order of time; held before the first and after the last. Between two, the shorter turn is taken.",
+        description="Poses in order of time; held before the first and after the last.",
     )
-    smooth: bool = Field(default=False, description="Ease in and out between keyframes, without jumps of velocity.")
+    turns: Literal["as_given", "shortest"] = Field(
+        default="as_given",
+        description='Between two keyframes, "as_given" interpolates each angle, so that 720 degrees are two turns; "shortest" turns '
+        "evenly about one axis, by no more than 180 degrees.",
+    )
+    smooth: StrictBool = Field(default=False, description="Ease in and out between keyframes, without jumps of velocity.")
     velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="Velocity of `center`, m/s.")
     angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="Spin, rad/s: its direction is the axis.")
     center: Vector | None = Field(
@@ -351,11 +418,11 @@ class Motion(Table):
 class Selection(Table):
     """Vertices of a body, chosen in one way; places are those at the start, in the scene's coordinates."""
 
-    vertices: list[Annotated[int, Field(ge=0)]] | None = Field(default=None, description="Indices into the body's vertices.")
+    vertices: list[Index] | None = Field(default=None, description="Indices into the body's vertices.")
     box: tuple[Vector, Vector] | None = Field(default=None, description="Lower and upper corner, m.")
     sphere: tuple[Vector, Positive] | None = Field(default=None, description="Centre and radius, m.")
     nearest: Vector | None = Field(default=None, description="The one vertex nearest to this point, m.")
-    all: bool = Field(default=False, description="Every vertex.")
+    all: StrictBool = Field(default=False, description="Every vertex.")
 
     @model_validator(mode="after")
     def _check(self) -> "Selection":
@@ -383,7 +450,7 @@ class Attachment(Table):
     """Springs between vertices of two bodies."""
 
     bodies: tuple[str, str] = Field(description="Names of the two bodies; an obstacle may be one; both may be the same.")
-    pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] | None = Field(
+    pairs: list[tuple[Index, Index]] | None = Field(
         default=None, description="Vertex of the first and of the second body, pair by pair."
     )
     within: Positive | None = Field(
@@ -407,9 +474,7 @@ class Attachment(Table):
 class Copies(Table):
     """A body repeated in a grid; the copies are called `name[0]`, `name[1]`, ... with x running fastest, then y, then z."""
 
-    counts: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = Field(
-        default=(1, 1, 1), description="Copies along x, y, z."
-    )
+    counts: tuple[Count, Count, Count] = Field(default=(1, 1, 1), description="Copies along x, y, z.")
     spacing: Vector = Field(default=(1.0, 1.0, 1.0), description="From one copy to the next along x, y, z, m.")
 
 
@@ -427,7 +492,7 @@ class Solid(Body):
 
     kind: Literal["solid"] = "solid"
     material: SolidMaterial = Field(default_factory=SolidMaterial, description="What it is made of.")
-    tetrahedralize: bool = Field(
+    tetrahedralize: StrictBool = Field(
         default=False, description='Fill a closed triangle mesh with tets on loading; needs the extra "tetrahedralize".'
     )
 
@@ -439,10 +504,61 @@ class Cloth(Body):
     material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
 
 
-class Obstacle(Placed):
-    """A rigid surface, open or closed, that moves as told and feels nothing."""
+def _cache_kind(value: Any) -> str | None:
+    if isinstance(value, str | Path):
+        return "file"
+    return "framearrays" if isinstance(value, dict | FrameArrays) else None
 
-    motion: Motion | None = Field(default=None, description="How it moves; absent: not at all.")
+
+def _motion_kind(value: Any) -> str:
+    return "deformation" if isinstance(value, Deformation) or (isinstance(value, dict) and "cache" in value) else "motion"
+
+
+class FrameArrays(Table):
+    """Positions of all vertices of an obstacle over time, given by their numbers."""
+
+    vertices: Annotated[np.ndarray, BeforeValidator(_frames), _AS_LIST, _FRAMES_SCHEMA] = Field(
+        description="V (f, n, 3): of each frame, m."
+    )
+    times: list[Number] = Field(description="When each frame is there, s, ascending; counted from the first.")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FrameArrays) and self.times == other.times and np.array_equal(self.vertices, other.vertices)
+
+
+class Deformation(Table):
+    """All vertices of an obstacle over time: a cache, as animation programs write it. In between vertices go straight.
+
+    It stands and is scaled as the mesh is. Before its first frame and after its last it holds still.
+    """
+
+    cache: Annotated[
+        Annotated[_File, Tag("file")] | Annotated[FrameArrays, Tag("framearrays")],
+        Discriminator(
+            _cache_kind,
+            custom_error_type="cache",
+            custom_error_message="must be a file, a pattern of files, or a table with vertices and times",
+        ),
+    ] = Field(
+        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD), a pattern of files that are a frame each, "
+        "such as `body_*.obj`, or arrays; of as many vertices as the mesh has."
+    )
+    frame_rate: Positive | None = Field(
+        default=None, le=1e6, description="Frames a second; absent: at the times that the cache says."
+    )
+    start: NotNegative = Field(default=0.0, description="When its first frame is there, s.")
+
+
+class Obstacle(Placed):
+    """A surface, open or closed, that moves or deforms as told and feels nothing."""
+
+    motion: (
+        Annotated[
+            Annotated[Motion, Tag("motion")] | Annotated[Deformation, Tag("deformation")],
+            Discriminator(_motion_kind),
+        ]
+        | None
+    ) = Field(default=None, description="How it moves: rigidly, or with a cache of all its vertices; absent: not at all.")
 
 
 # --- forces ---

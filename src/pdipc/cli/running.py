@@ -1,0 +1,289 @@
+"""`pdipc run`, and `pdipc info`, which tells what came of it."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pdipc.cli.app import SceneArgument, command, load, metres
+
+if TYPE_CHECKING:
+    from pdipc.output.results import Run
+    from pdipc.scene.schema import Scene
+    from pdipc.simulation import StepInfo
+
+
+class Precision(StrEnum):
+    """Working precisions."""
+
+    auto = "auto"
+    float32 = "float32"
+    float64 = "float64"
+
+
+@command()
+def run(
+    scene: SceneArgument,
+    out: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Run folder; default: runs/<scene>.")
+    ] = None,
+    device: Annotated[str | None, typer.Option(help='"cpu" or "cuda:0"; default: the scene\'s, else CUDA if present.')] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help="Number of steps; default: the scene's.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint in the run folder.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in the folder.")] = False,
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.001, help="No further outer iteration of a step after this time, ms.")
+    ] = None,
+    certify: Annotated[bool, typer.Option("--certify", help="Record every motion for `pdipc certify`.")] = False,
+    solver: Annotated[str | None, typer.Option(help="Linear solver of the global step.")] = None,
+    precision: Annotated[Precision | None, typer.Option(help="Working precision.")] = None,
+    audited: Annotated[
+        bool, typer.Option("--audit", help="Print energies and momenta at the end, as `pdipc audit` does.")
+    ] = False,
+) -> None:
+    """Simulate a scene into a folder. Ctrl-C ends it after a step; --resume goes on as if it had never been stopped."""
+    from pdipc.output.results import open_run
+
+    if resume and overwrite:
+        raise typer.BadParameter("--resume and --overwrite exclude each other")
+    loaded = load(scene)
+    overrides = {"linear_solver": solver, "precision": precision and precision.value, "budget_ms": budget_ms}
+    for name, value in overrides.items():
+        if value is not None:
+            _override(loaded, name, value)
+    folder = out or Path("runs") / Path(scene).stem
+    begun = open_run(folder).frame_count - 1 if resume else 0
+    total = loaded.simulation.steps if steps is None else steps
+    began = time.monotonic()
+    stop = Stop()
+    try:
+        with stop.after_steps(), _bar(total) as bar:
+            from pdipc.simulation import run_scene
+
+            def advance(info: "StepInfo") -> None:
+                bar(info)
+                stop.step_done(info.step)
+
+            options = {"resume": resume, "overwrite": overwrite, "certify": certify}
+            run_scene(loaded, folder, steps=steps, device=device, progress=advance, **options)
+    except KeyboardInterrupt:
+        if stop.done is None:
+            typer.echo("pdipc: interrupted before a step was taken", err=True)
+        else:
+            given = {
+                "--steps": steps,
+                "--solver": solver,
+                "--precision": precision and precision.value,
+                "--budget-ms": budget_ms,
+            }
+            said = "".join(f" {name} {value}" for name, value in given.items() if value is not None)
+            typer.echo(
+                f"pdipc: stopped after step {stop.done} of {total}, everything is saved in {folder}; go on with:\n"
+                f"  pdipc run {scene} -o {folder}{said}{' --certify' if certify else ''} --resume",
+                err=True,
+            )
+        raise typer.Exit(128 + stop.signal) from None  # what shells expect
+    if resume and begun >= total:
+        typer.echo(f"{folder} has {begun} steps already; nothing was added to it")
+    _summary(folder, time.monotonic() - began)
+    if audited:
+        from pdipc.cli.judging import audit
+
+        audit(folder)
+
+
+def _override(scene: "Scene", name: str, value: Any) -> None:
+    from pdipc.scene.errors import SceneError
+
+    try:
+        setattr(scene.simulation, name, value)
+    except SceneError as error:
+        option = "solver" if name == "linear_solver" else name.replace("_", "-")
+        said = str(error).partition(": ")[2]
+        raise typer.BadParameter(f'"{value}": {said}', param_hint=f"--{option}") from None
+
+
+class Stop:
+    """Ctrl-C and SIGTERM: they raise KeyboardInterrupt between two steps; before the first step, or given twice, at once.
+
+    done: the last step that was told, None before the first. signal: the one that came.
+    """
+
+    def __init__(self) -> None:
+        self.done: int | None = None
+        self.signal = signal.SIGINT
+        self._wanted = False
+
+    @contextmanager
+    def after_steps(self) -> Iterator[None]:
+        """Takes the signals over."""
+        taken = [signal.SIGINT, signal.SIGTERM]
+        previous = [signal.signal(each, self._heard) for each in taken]
+        try:
+            yield
+        except Exception:
+            if (
+                self._wanted
+            ):  # some libraries turn an interrupt into an error of their own, or lose it: `step_done` raises it then
+                raise KeyboardInterrupt from None
+            raise
+        finally:
+            for each, handler in zip(taken, previous, strict=True):
+                signal.signal(each, handler)
+
+    def _heard(self, number: int, _: object) -> None:
+        at_once = self._wanted or self.done is None
+        self._wanted, self.signal = True, signal.Signals(number)
+        if at_once:
+            raise KeyboardInterrupt
+
+    def step_done(self, step: int) -> None:
+        """To be called between two steps."""
+        self.done = step
+        if self._wanted:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Callable[["StepInfo"], None]]:
+    """A bar of steps on stderr; yields a function to call after each."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = [TextColumn("step"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[told]}")]
+    last = time.monotonic()
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+        task = bar.add_task("step", total=total, told="preparing")
+
+        def advance(info: "StepInfo") -> None:
+            nonlocal last
+            now, result = time.monotonic(), info.result
+            told = f"outer {result.outer:<3d} contacts {result.barriers:<6d} gap {metres(result.smallest_gap)}"
+            bar.update(task, completed=info.step, total=info.steps, told=f"{told}  {1000 * (now - last):.0f} ms/step")
+            last = now
+
+        def compiled(modules: int) -> None:
+            if modules == 1:
+                bar.console.print("compiling kernels: about a minute, once; they are kept for later runs")
+            bar.update(task, told=f"{modules} modules of kernels compiled")
+
+        with _told_of_compiling(compiled):
+            yield advance
+
+
+@contextmanager
+def _told_of_compiling(tell: Callable[[int], None]) -> Iterator[None]:
+    """Calls `tell` with the number of kernel modules that Warp has compiled, after each."""
+    import warp as wp
+
+    from pdipc.device import precision  # noqa: F401  (makes Warp quiet: what is set here comes after)
+
+    usual, modules = wp.get_logger(), 0
+
+    class Listening:
+        debug, warning, error = staticmethod(usual.debug), staticmethod(usual.warning), staticmethod(usual.error)
+
+        @staticmethod
+        def info(message: str) -> None:
+            nonlocal modules
+            if message.endswith("(compiled)"):
+                modules += 1
+                tell(modules)
+
+    level = wp.config.log_level
+    wp.set_logger(Listening())
+    wp.config.log_level = wp.LOG_INFO
+    try:
+        yield
+    finally:
+        wp.set_logger(usual)
+        wp.config.log_level = level
+
+
+def _summary(folder: Path, seconds: float) -> None:
+    from pdipc.output.results import open_run
+
+    done = open_run(folder)
+    typer.echo(f"{folder}: {done.frame_count - 1} steps, {done.times[-1]:g} s simulated, {seconds:.1f} s of work")
+    typer.echo(f"smallest gap {metres(_smallest_gap(done))}")
+    stopped = sum(not record.get("converged", True) for record in done.stats)
+    if stopped:
+        typer.echo(f"{stopped} steps ended at the limit of outer iterations before convergence; they are free of intersections")
+
+
+def _smallest_gap(done: "Run") -> float | None:
+    return min((record["smallest_gap"] for record in done.stats if record.get("smallest_gap") is not None), default=None)
+
+
+@command()
+def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run folder or a scene.")]) -> None:
+    """Describe a run or a scene."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdipc.output.results import open_run
+    from pdipc.scene.assembly import assemble
+
+    console = Console(soft_wrap=True, highlight=False)
+    path = Path(what)
+    opened = open_run(path) if path.is_dir() else None
+    scene = load(what)
+    assembly = assemble(scene)
+    console.print(f"{scene.title or what}", style="bold", markup=False)
+    if scene.description:
+        console.print(scene.description, markup=False)
+    table = Table(box=box.SIMPLE)
+    for name in ("body", "kind", "vertices", "triangles", "tets"):
+        table.add_column(name, justify="left" if name in ("body", "kind") else "right")
+    for body in assembly.bodies:
+        table.add_row(body.name, body.kind, str(body.last - body.first), str(len(body.triangles)), str(len(body.tets)))
+    console.print(table)
+    sim = scene.simulation
+    console.print(f"{sim.steps} steps of {sim.time_step:g} s, linear solver {sim.linear_solver}, precision {sim.precision}")
+    console.print(
+        f"size {metres(assembly.scene_size)}, activation distance {metres(assembly.activation_distance)}, "
+        f"minimum separation {metres(assembly.minimum_separation)}"
+    )
+    if opened is not None:
+        for line in _told_of(opened, sim.steps):
+            console.print(line, markup=False)
+
+
+def _told_of(opened: "Run", steps: int) -> Iterator[str]:
+    """Lines about a run: time, convergence, contact, machine, versions."""
+    stats, meta = opened.stats, opened.meta
+    yield f"{opened.frame_count} frames, {opened.times[-1] if opened.frame_count else 0:g} s; {len(stats)} of {steps} steps done"
+    spent = sorted(sum(record["milliseconds"].values()) for record in stats if record.get("milliseconds"))
+    if spent:
+        yield f"{sum(spent) / 1e3:.3g} s of work, median {spent[len(spent) // 2]:.3g} ms a step, longest {spent[-1]:.3g} ms"
+    judged = [record["converged"] for record in stats if "converged" in record]
+    if judged:
+        worst = max((record["residual"] for record in stats if record.get("residual") is not None), default=None)
+        share = 100.0 * sum(judged) / len(judged)
+        yield f"{share:.4g} % of the steps converged ({len(judged) - sum(judged)} did not), worst residual {_residual(worst)}"
+    contacts = [record["barriers"] for record in stats if "barriers" in record]
+    if contacts:
+        yield f"smallest gap {metres(_smallest_gap(opened))}, at most {max(contacts)} contacts"
+    on = [f"{meta[name]}" for name in ("device", "precision", "machine") if name in meta]
+    if "threads" in meta:
+        on.insert(1, f"{meta['threads']} threads")
+    yield "made on " + ", ".join(on)
+    versions = ("pdipc", "warp-lang", "numpy", "python")
+    yield "with " + ", ".join(f"{name} {meta[name]}" for name in versions if name in meta)
+    rest = {
+        name: value
+        for name, value in meta.items()
+        if name not in {*versions, "format", "device", "precision", "machine", "threads"}
+    }
+    if rest:
+        yield ", ".join(f"{name} {value}" for name, value in rest.items())
+
+
+def _residual(length: float | None) -> str:
+    return "unknown" if length is None else metres(length)

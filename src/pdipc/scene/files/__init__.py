@@ -1,0 +1,37 @@
+"""Mesh files taken apart: points and cells of every kind as they are written, and what was left out.
+
+`pdipc.scene.meshes` makes triangles and tetrahedra of them. Formats that other packages parse are read in a process of their own,
+see `pdipc.scene.worker`.
+"""
+
+from pathlib import Path
+
+from pdipc.scene.files import foreign, surfaces, volumes
+from pdipc.scene.files.contents import Contents
+
+READERS = {
+    ".msh": volumes.msh, ".mesh": volumes.medit, ".node": volumes.tetgen, ".ele": volumes.tetgen,
+    ".vtk": foreign.by_meshio, ".vtu": foreign.by_meshio, ".glb": foreign.glb,
+    ".usd": foreign.usd, ".usda": foreign.usd, ".usdc": foreign.usd,
+    ".obj": surfaces.obj, ".ply": surfaces.ply, ".stl": surfaces.stl, ".off": surfaces.off, ".npz": surfaces.npz,
+}  # fmt: skip
+
+
+def parse(path: Path, frames: bool = False) -> Contents:
+    """The contents of a file of a known format. Raises whatever its reader does; SceneError where its message is whole.
+
+    frames: whether all frames of a USD file are wanted, which takes time.
+    """
+    own = reader(path)
+    return foreign.usd(path, frames) if own is foreign.usd else own(path)
+
+
+def reader(path: Path):
+    """The function that reads a file: some that call themselves .msh are not of Gmsh, or of a version that meshio knows better."""
+    own = READERS[path.suffix.lower()]
+    return foreign.by_meshio if own is volumes.msh and not volumes.is_known(path) else own
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether another package parses this file."""
+    return reader(path) in (foreign.by_meshio, foreign.glb, foreign.usd)

@@ -1,0 +1,192 @@
+"""Formats that other packages parse: VTK and others by meshio, glTF by trimesh, USD by its own library."""
+
+import contextlib
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pdipc.scene.errors import SceneError
+from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, Damaged
+from pdipc.scene.files.volumes import is_gmsh
+
+
+def by_meshio(path: Path) -> Contents:
+    import meshio
+
+    form = {".vtk": "vtk", ".vtu": "vtu"}.get(path.suffix.lower()) or ("gmsh" if is_gmsh(path) else "ansys")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            mesh = meshio.read(path, file_format=form)
+    except SystemExit as error:  # meshio prints what is wrong and ends the process on some files
+        raise Damaged(" ".join(said.getvalue().split())) from error
+    found = Contents(np.asarray(mesh.points, dtype=np.float64))
+    polygons = [np.asarray(block.data) for block in mesh.cells if block.type.startswith("polygon")]
+    counts = [np.full(len(block), block.shape[1]) for block in polygons if len(block)]
+    if counts:
+        found.polygons = np.concatenate([block.ravel() for block in polygons]), np.concatenate(counts)
+    for block in mesh.cells:
+        if block.type.startswith("polygon"):
+            continue
+        base = re.sub(r"^VTK_(LAGRANGE|BEZIER|HIGHER_ORDER)_|^VTK_QUADRATIC_|[0-9_]*$", "", block.type).lower()
+        base = {"tetrahedron": "tetra", "quadrilateral": "quad", "curve": "line", "edge": "line"}.get(base, base)
+        rows = block.data
+        if base in ORDER_AS_HEXAHEDRON:
+            base, order = ORDER_AS_HEXAHEDRON[base]
+            rows = np.asarray(rows)[:, order]
+        if base in CORNERS:
+            found.cells.append((base, np.asarray(rows)))
+        else:
+            found.notes.append(f"{len(rows)} cells of the kind {block.type} were left out")
+    return found
+
+
+def glb(path: Path) -> Contents:
+    import trimesh
+
+    scene = trimesh.load_scene(path, process=False)
+    kinds = {name: type(geometry).__name__ for name, geometry in scene.geometry.items()}
+    points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    notes, others = [], [name for name in kinds if kinds[name] != "Trimesh"]
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        if kinds[name] == "Trimesh":
+            mesh = scene.geometry[name]
+            points.append(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+            faces = np.asarray(mesh.faces)
+            if len(faces) and (faces.min() < 0 or faces.max() >= len(mesh.vertices)):
+                raise Damaged("a triangle names a vertex that is not there: index out of range")
+            triangles.append((faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces) + count)
+            count += len(mesh.vertices)
+    if others:
+        notes.append(f"{len(others)} lines or clouds of points were left out")
+    head = path.read_bytes()[:20]
+    length = int.from_bytes(head[12:16], "little") if head[:4] == b"glTF" else 0
+    text = path.read_bytes()[20 : 20 + length]
+    moving = [name for name in ("skins", "animations", "targets") if f'"{name}"'.encode() in text]
+    if moving:
+        notes.append(f"{' and '.join(moving)} were left out: the mesh is as it stands without them")
+    return Contents(np.concatenate(points), [("triangle", np.concatenate(triangles))], notes=notes, repeats=True)
+
+
+def usd(path: Path, frames: bool = False) -> Contents:
+    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times."""
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError as error:
+        raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
+    stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
+    first = Usd.TimeCode.EarliestTime()
+    prims, found, others, hidden = [], Contents(np.zeros((0, 3))), {}, 0
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        kind = str(prim.GetTypeName())
+        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
+            continue
+        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
+            hidden += 1
+        elif kind in ("Mesh", "TetMesh"):
+            prims.append(prim)
+        else:
+            others[kind] = others.get(kind, 0) + 1
+    if not prims:
+        raise SceneError(f'mesh file "{path}": holds no Mesh')
+    convert, said = _units(stage)
+    found.points = convert(_usd_points(prims, first))
+    corners, counts, size = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
+    for prim in prims:
+        own = len(prim.GetAttribute("points").Get(first))
+        tets = prim.GetAttribute("tetVertexIndices" if prim.IsA("TetMesh") else "tetraIndices")
+        if tets and tets.HasValue():
+            # a mirror turns tets inside out; those of a whole block are turned back
+            found.cells.append(("tetra", np.array(tets.Get(first)).reshape(-1, 4) + size))
+        else:
+            rows, sides = _usd_faces(prim, own, first)
+            corners.append(rows + size)
+            counts.append(sides)
+        size += own
+    found.polygons = np.concatenate(corners), np.concatenate(counts)
+    times = sorted({time for prim in prims for time in _usd_times(prim)})
+    if frames and len(times) > 1:
+        found.frames = np.stack([convert(_usd_points(prims, Usd.TimeCode(time))) for time in times])
+        found.times = np.array(times) / stage.GetTimeCodesPerSecond()
+    found.notes += said
+    if others:
+        listed = ", ".join(f"{number} {kind}" for kind, number in sorted(others.items()))
+        found.notes.append(f"what is no Mesh was left out: {listed}")
+    if hidden:
+        found.notes.append(f"{hidden} invisible prims were left out")
+    if len(times) > 1 and not frames:
+        found.notes.append(_first_of(len(times)))
+    return found
+
+
+def _usd_points(prims: list, time) -> np.ndarray:
+    """(n, 3) points of all prims at a time, in the stage's coordinates."""
+    from pxr import UsdGeom
+
+    placed, points = UsdGeom.XformCache(time), []
+    for prim in prims:
+        values = prim.GetAttribute("points").Get(time)
+        if not values:
+            raise Damaged(f'{prim.GetTypeName()} "{prim.GetPath()}" has no points')
+        matrix = np.array(placed.GetLocalToWorldTransform(prim))  # for rows: p' = p M
+        points.append(np.array(values, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3])
+    return np.concatenate(points)
+
+
+def _usd_faces(prim, size: int, time) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the faces of a Mesh, one after another, and corners of each; without holes, and facing outward in the stage."""
+    from pxr import UsdGeom
+
+    sides = np.array(prim.GetAttribute("faceVertexCounts").Get(time), dtype=np.int64).ravel()
+    rows = np.array(prim.GetAttribute("faceVertexIndices").Get(time), dtype=np.int64).ravel()
+    if (len(sides) and sides.min() < 0) or sides.sum() != len(rows):
+        raise Damaged(f'Mesh "{prim.GetPath()}" has {len(rows)} corners, and its faces say {sides.sum()}')
+    if len(rows) and (rows.min() < 0 or rows.max() >= size):
+        raise Damaged(f'Mesh "{prim.GetPath()}" names a vertex that is not there; indices must be 0 to {size - 1}')
+    matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+    left = prim.GetAttribute("orientation").Get(time) == UsdGeom.Tokens.leftHanded
+    if (np.linalg.det(matrix[:3, :3]) < 0) != left:
+        ends = np.cumsum(sides)  # every face backwards
+        within = np.arange(len(rows)) - np.repeat(ends - sides, sides)
+        rows = rows[np.repeat(ends, sides) - 1 - within]
+    kept = np.ones(len(sides), dtype=bool)
+    kept[[hole for hole in prim.GetAttribute("holeIndices").Get(time) or [] if 0 <= hole < len(sides)]] = False
+    return rows[np.repeat(kept, sides)], sides[kept]
+
+
+def _usd_times(prim) -> list[float]:
+    """The time codes at which a prim's points or its place are given."""
+    from pxr import UsdGeom
+
+    times = list(prim.GetAttribute("points").GetTimeSamples())
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsA(UsdGeom.Xformable):
+            times += UsdGeom.Xformable(prim).GetTimeSamples()
+        prim = prim.GetParent()
+    return times
+
+
+def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
+    """What turns a stage's points into metres with y up, and the notes that say so."""
+    from pxr import UsdGeom
+
+    unit, notes = 1.0, ["it does not say metersPerUnit: its numbers were taken as m"]
+    if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        unit = UsdGeom.GetStageMetersPerUnit(stage)
+        notes = [f"its unit of {unit:g} m was converted to m"] if unit != 1.0 else []
+    upright = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    if not upright:
+        notes.append("its z axis, which points up, was turned to y")
+
+    def convert(points: np.ndarray) -> np.ndarray:
+        return points * unit if upright else points[:, [0, 2, 1]] * [unit, unit, -unit]
+
+    return convert, notes
+
+
+def _first_of(count: int) -> str:
+    return f"it moves or deforms at {count} times: it was read as it is at the first"

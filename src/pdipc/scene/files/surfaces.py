@@ -1,0 +1,248 @@
+"""NumPy archives, and the formats of surfaces: Wavefront OBJ, OFF, STL and PLY."""
+
+import re
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from pdipc.scene.errors import SceneError
+from pdipc.scene.files.contents import Contents, Damaged, floats, lines_left_out, whole
+
+
+def npz(path: Path) -> Contents:
+    with zipfile.ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    if size > 100 * path.stat().st_size + 2**30:
+        raise Damaged(f"it would unpack to {size / 2**30:.3g} GiB")
+    with np.load(path) as data:
+        if "V" not in data:
+            raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets) or F (triangles)')
+        cells = [(kind, data[name]) for kind, name in (("tetra", "T"), ("triangle", "F")) if name in data]
+        vertices = data["V"]
+        if vertices.ndim != 3 or not len(vertices):
+            return Contents(vertices, cells)
+        return Contents(vertices[0], cells, frames=vertices, times=data.get("times"))
+
+
+def obj(path: Path) -> Contents:
+    """Wavefront OBJ: v, f and l; indices count from 1, or back from the last vertex so far."""
+    points, corners, counts, lines, others = [], [], [], 0, set()
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        key, *values = line.split() or [""]
+        if key == "v":
+            if len(values) < 3:
+                raise Damaged(f"line {number} has {len(values)} coordinates of a vertex; needed: 3")
+            points.append(values[:3])
+        elif key == "f":
+            if len(values) < 3:
+                raise Damaged(f"line {number} has a face of {len(values)} vertices; needed: at least 3")
+            counts.append(len(values))
+            for value in values:
+                index = int(value.partition("/")[0])
+                if index == 0 or index < -len(points):
+                    raise Damaged(f"line {number} names vertex {index}; vertices count from 1, or back from -1")
+                corners.append(index - 1 if index > 0 else len(points) + index)
+        elif key == "l":
+            lines += max(0, len(values) - 1)
+        elif key in ("p", "curv", "curv2", "surf"):
+            others.add(key)
+    found = Contents(floats(points, 3), polygons=(np.array(corners, dtype=np.int64), np.array(counts, dtype=np.int64)))
+    if lines:
+        found.notes.append(lines_left_out(lines))
+    if others:
+        found.notes.append(f"elements other than faces were left out: {', '.join(sorted(others))}")
+    return found
+
+
+def off(path: Path) -> Contents:
+    """Object File Format, as text."""
+    words = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace")).split()
+    head = re.fullmatch(r"(ST)?(C)?(N)?OFF", words[0]) if words else None
+    if head is None:
+        raise Damaged(f'it begins with "{words[0][:20] if words else ""}"; needed: OFF')
+    if words[1:2] == ["BINARY"]:
+        raise Damaged("it is binary; only text is read")
+    n, faces = int(words[1]), int(words[2])
+    at, width = 4, 3 + 3 * bool(head[3]) + 4 * bool(head[2]) + 2 * bool(head[1])
+    if not 0 <= n * width <= len(words) - at:
+        raise Damaged(f"its head says {n} vertices, and the file ends before")
+    points = floats(words[at : at + n * width], width)[:, :3]
+    # what follows a face, its colour, has no count: faces are lines
+    lines = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace")).splitlines()
+    rows = [row for row in (line.split() for line in lines) if row]
+    seen, start = 0, 0
+    while seen < at + n * width and start < len(rows):
+        seen += len(rows[start])
+        start += 1
+    rows = rows[start : start + faces]
+    if seen != at + n * width or len(rows) < faces or any(len(row) <= int(row[0]) for row in rows):
+        raise Damaged(f"its head says {faces} faces, and they are not there, a line each")
+    counts = np.array([int(row[0]) for row in rows], dtype=np.int64)
+    corners = np.array([int(index) for row in rows for index in row[1 : 1 + int(row[0])]], dtype=np.int64)
+    return Contents(points, polygons=(corners, counts))
+
+
+def stl(path: Path) -> Contents:
+    """Stereolithography, text or binary: triangles without shared vertices."""
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    if len(data) == 84 + 50 * count:
+        facets = np.frombuffer(data, dtype=[("head", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")], offset=84)
+        points = facets["corners"].reshape(-1, 3).astype(np.float64)
+    elif data.lstrip()[:5].lower() == b"solid":
+        words = data.decode("ascii", errors="replace").split()
+        at = [k for k, word in enumerate(words) if word.lower() == "vertex"]
+        points = floats([words[k + 1 : k + 4] for k in at], 3)
+        if len(points) % 3:
+            raise Damaged(f"it holds {len(points)} vertices, which are no whole triangles")
+    else:
+        raise Damaged(f"its head says {count} triangles, {84 + 50 * count} bytes, and it has {len(data)} bytes")
+    return Contents(points, [("triangle", np.arange(len(points)).reshape(-1, 3))], repeats=True)
+
+
+PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+
+def ply(path: Path) -> Contents:
+    """Polygon File Format, text or binary; faces may have different numbers of corners."""
+    data = path.read_bytes()
+    ended = re.search(rb"end_header[ \t]*\r?\n", data[: 1 << 20])
+    if not data.startswith(b"ply") or ended is None:
+        raise Damaged('it has no head from "ply" to "end_header"')
+    layout, elements = "", []  # name, count, [(name, type of a list's count or None, type)]
+    for line in data[: ended.start()].decode("ascii", errors="replace").splitlines():
+        match line.split():
+            case ["format", name, _]:
+                layout = name
+            case ["element", name, count]:
+                elements.append((name, int(count), []))
+            case ["property", "list", count, kind, name]:
+                elements[-1][2].append((name, PLY_TYPES[count], PLY_TYPES[kind]))
+            case ["property", kind, name]:
+                elements[-1][2].append((name, None, PLY_TYPES[kind]))
+    if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise Damaged(f'its format is "{layout}"; needed: ascii, binary_little_endian or binary_big_endian')
+    take = _PlyText(data[ended.end() :]) if layout == "ascii" else _PlyBinary(data[ended.end() :], "<>"["big" in layout])
+    points, polygons, notes = np.zeros((0, 3)), Contents.polygons, []
+    for name, count, properties in elements:
+        if count < 0:
+            raise Damaged(f"its head says {count} of {name}")
+        columns, lists = take.element(name, count, properties)
+        if name == "vertex":
+            if not {"x", "y", "z"} <= set(columns):
+                raise Damaged("its vertices have no x, y and z")
+            points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+        elif name == "face":
+            if not {"vertex_indices", "vertex_index"} & set(lists):
+                raise Damaged("its faces have no vertex_indices")
+            polygons = lists.get("vertex_indices") or lists["vertex_index"]
+        elif name == "tristrips":
+            notes.append(f"{count} strips of triangles were left out; write them as faces")
+        elif name == "edge" and count:
+            notes.append(lines_left_out(count))
+    return Contents(points, polygons=polygons, notes=notes)
+
+
+class _PlyText:
+    """Elements of a PLY file one after another, as words."""
+
+    def __init__(self, data: bytes):
+        self.words, self.at = data.decode("ascii", errors="replace").split(), 0
+
+    def element(self, name: str, count: int, properties: list) -> tuple[dict, dict]:
+        """Columns of single values (count,) and of lists (all values, counts), by property."""
+        if all(of_count is None for _, of_count, _ in properties):
+            width = len(properties)
+            table = floats(self._take(count * width, name), width) if width else np.zeros((count, 0))
+            return {own: table[:, k] for k, (own, _, _) in enumerate(properties)}, {}
+        values: dict[str, list] = {own: [] for own, _, _ in properties}
+        counts: dict[str, list] = {own: [] for own, of_count, _ in properties if of_count}
+        for _ in range(count):
+            for own, of_count, _ in properties:
+                size = int(self._take(1, name)[0]) if of_count else 1
+                if of_count:
+                    counts[own].append(size)
+                values[own] += self._take(size, name)
+        numbers = {own: np.array(values[own], dtype=np.float64) for own in values}
+        lists = {own: (whole(numbers.pop(own)), np.array(sizes, dtype=np.int64)) for own, sizes in counts.items()}
+        return numbers, lists
+
+    def _take(self, size: int, name: str) -> list[str]:
+        if not 0 <= size <= len(self.words) - self.at:
+            raise Damaged(f"it ends within its elements of the kind {name}")
+        self.at += size
+        return self.words[self.at - size : self.at]
+
+
+class _PlyBinary:
+    """Elements of a PLY file one after another, as bytes."""
+
+    def __init__(self, data: bytes, order: str):
+        self.data, self.order, self.at = data, order, 0
+
+    def element(self, name: str, count: int, properties: list) -> tuple[dict, dict]:
+        """Columns of single values (count,) and of lists (all values, counts), by property."""
+        lists = [own for own, of_count, _ in properties if of_count]
+        sizes = self._sizes(properties) if lists and count else {}
+        row = self._row(properties, sizes)
+        if row.itemsize * count <= len(self.data) - self.at:
+            table = np.frombuffer(self.data, row, count, self.at)
+            if all(np.all(table[f"{own} count"] == sizes[own]) for own in lists if count):
+                self.at += row.itemsize * count
+                singles = {own: table[own] for own, of_count, _ in properties if not of_count}
+                return singles, {own: (table[own].ravel(), table[f"{own} count"].astype(np.int64)) for own in lists}
+        if not lists:
+            raise Damaged(f"it ends within its elements of the kind {name}")
+        return self._one_by_one(name, count, properties)
+
+    def _row(self, properties: list, sizes: dict[str, int]) -> np.dtype:
+        fields = []
+        for own, of_count, kind in properties:
+            fields += [(f"{own} count", self.order + of_count)] if of_count else []
+            fields += [(own, self.order + kind, (sizes.get(own, 0),) if of_count else ())]
+        return np.dtype(fields)
+
+    def _sizes(self, properties: list) -> dict[str, int]:
+        """The lengths of the lists of the first row."""
+        at, sizes = self.at, {}
+        for own, of_count, kind in properties:
+            size = 1
+            if of_count:
+                sizes[own] = size = self._number(at, of_count, own)
+                at += np.dtype(of_count).itemsize
+            at += size * np.dtype(kind).itemsize
+        return sizes
+
+    def _number(self, at: int, kind: str, name: str) -> int:
+        width = np.dtype(kind).itemsize
+        if at + width > len(self.data):
+            raise Damaged(f"it ends within its elements of the kind {name}")
+        size = int(np.frombuffer(self.data, self.order + kind, 1, at)[0])
+        if not 0 <= size * width <= len(self.data):
+            raise Damaged(f"a list of {size} values is longer than the file")
+        return size
+
+    def _one_by_one(self, name: str, count: int, properties: list) -> tuple[dict, dict]:
+        codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+        values: dict[str, list] = {own: [] for own, _, _ in properties}
+        counts: dict[str, list] = {own: [] for own, of_count, _ in properties if of_count}
+        for _ in range(count):
+            for own, of_count, kind in properties:
+                size = 1
+                if of_count:
+                    size = self._number(self.at, of_count, name)
+                    self.at += np.dtype(of_count).itemsize
+                    counts[own].append(size)
+                width = size * np.dtype(kind).itemsize
+                if self.at + width > len(self.data):
+                    raise Damaged(f"it ends within its elements of the kind {name}")
+                values[own] += struct.unpack_from(f"{self.order}{size}{codes[kind]}", self.data, self.at)
+                self.at += width
+        arrays = {own: np.array(values[own]) for own in values}
+        return arrays, {own: (arrays.pop(own), np.array(sizes, dtype=np.int64)) for own, sizes in counts.items()}

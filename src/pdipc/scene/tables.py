@@ -1,0 +1,43 @@
+"""What all tables of a scene share: strict numbers, no unknown keys, and SceneError for what is wrong."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+
+from pdipc.scene.errors import SceneError
+from pdipc.scene.explain import explain
+
+
+def _refuse_text(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_ | str | bytes):
+        raise ValueError("must be a number")
+    if isinstance(value, int) and abs(value) > 10**300:
+        raise ValueError("must be a number that 64 bits hold")
+    return value
+
+
+Real = Annotated[float, BeforeValidator(_refuse_text)]  # true and "1" are no numbers
+Whole = Annotated[int, BeforeValidator(_refuse_text)]
+
+
+class _Model(type(BaseModel)):
+    """Makes tables in Python raise what files raise."""
+
+    def __call__(cls, *args: Any, **tables: Any) -> Any:
+        try:
+            return super().__call__(*args, **tables)
+        except ValidationError as error:
+            raise SceneError("\n  ".join(explain(error, tables, cls))) from error
+
+
+class Table(BaseModel, metaclass=_Model):
+    """What all tables share: unknown keys are refused, also on assignment from Python. Raises SceneError."""
+
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, arbitrary_types_allowed=True)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except ValidationError as error:
+            raise SceneError("\n  ".join(explain(error, {name: value}, type(self)))) from error

@@ -1,0 +1,414 @@
+"""What mesh files hold comes out whole: areas, volumes and counts that follow from the files; what does not is said."""
+
+import struct
+import time
+
+import meshio
+import numpy as np
+import pytest
+
+from pdipc.scene import cells, generators, meshes, worker
+from pdipc.scene.errors import SceneError
+
+QUAD_AND_TRIANGLES = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 1], [1, 0, 1], [2, 0, 1]], dtype=float)
+
+
+def area(mesh: meshes.Mesh) -> float:
+    return meshes.triangle_areas(mesh.vertices, mesh.triangles).sum()
+
+
+def volume(mesh: meshes.Mesh) -> float:
+    volumes = meshes.tet_volumes(mesh.vertices, mesh.tets)
+    assert volumes.min() > 0
+    return volumes.sum()
+
+
+# --- cutting ---
+
+
+def polygon_area(ring: np.ndarray) -> float:
+    return np.linalg.norm(np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)) / 2
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_concave_polygons_keep_their_area_and_all_their_corners(seed):
+    """Stars in any plane, with corners on straight sides, whose neighbours would be torn off without them."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(4, 12))
+    angle = 2 * np.pi * (np.arange(n) + rng.uniform(-0.3, 0.3, n)) / n
+    ring = rng.uniform(0.2, 1.0, n)[:, None] * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    k = int(rng.integers(n))
+    ring = np.insert(ring, k + 1, 0.5 * (ring[k] + ring[(k + 1) % n]), axis=0)
+    points = (ring @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T + rng.normal(size=3)) * 10.0 ** rng.uniform(-3, 3)
+    triangles, crossed = cells.triangulate(points, np.arange(n + 1), np.array([n + 1]))
+    areas = meshes.triangle_areas(points, triangles)
+    assert (len(triangles), crossed) == (n - 1, 0)
+    assert areas.min() > 0
+    assert areas.sum() == pytest.approx(polygon_area(points - points[0]), rel=1e-9)
+    assert set(triangles.ravel()) == set(range(n + 1))
+
+
+def test_a_concave_quad_is_cut_within_itself():
+    points = np.array([[0, 0, 0], [2, 0, 0], [0.2, 0, 0.2], [0, 0, 2]], dtype=float)
+    for shift in range(4):
+        triangles, crossed = cells.triangulate(points, np.roll(np.arange(4), shift), np.array([4]))
+        assert crossed == 0
+        assert meshes.triangle_areas(points, triangles).sum() == pytest.approx(polygon_area(points))
+
+
+@pytest.mark.parametrize("ring", [[0, 2, 1, 3], [0, 2, 4, 1, 3]])
+def test_polygons_that_cross_themselves_are_counted(ring):
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [-0.5, 0.5, 0]], dtype=float)
+    assert cells.triangulate(points, np.array(ring), np.array([len(ring)]))[1] == 1
+
+
+def box_cells(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points, numbered at random, and cells of one kind that fill a box of 2 x 3 x 2."""
+    shape = np.array([2, 3, 2])
+    grid = np.indices(tuple(shape + 1)).reshape(3, -1).T
+    number = rng.permutation(len(grid)).reshape(tuple(shape + 1))
+    points = np.empty((len(grid), 3))
+    points[number.ravel()] = grid
+    found = []
+    for x, y, z in np.indices(tuple(shape)).reshape(3, -1).T:
+        low, high = number[x : x + 2, y : y + 2, z], number[x : x + 2, y : y + 2, z + 1]
+        corner = [low[0, 0], low[1, 0], low[1, 1], low[0, 1], high[0, 0], high[1, 0], high[1, 1], high[0, 1]]
+        if kind == "hexahedron":
+            found.append(corner)
+        elif kind == "wedge":
+            found += [[corner[k] for k in wedge] for wedge in ([0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7])]
+        else:
+            points = np.append(points, [[x + 0.5, y + 0.5, z + 0.5]], axis=0)
+            found += [[*(corner[k] for k in face[::-1]), len(points) - 1] for face in cells.CELL_FACES["hexahedron"]]
+    return points, np.array(found)
+
+
+@pytest.mark.parametrize("kind", ["hexahedron", "wedge", "pyramid"])
+@pytest.mark.parametrize("seed", range(5))
+def test_cells_are_cut_so_that_neighbours_agree(kind, seed):
+    """The tets fill the box, and every face that is not on its surface belongs to two of them."""
+    points, given = box_cells(kind, np.random.default_rng(seed))
+    tets = cells.tetrahedra(kind, given)
+    volumes = meshes.tet_volumes(points, tets)
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(12.0)
+    skin = meshes.boundary(tets)
+    assert meshes.triangle_areas(points, skin).sum() == pytest.approx(2 * (6 + 6 + 4))
+
+
+def test_a_collapsed_hexahedron_is_cut_into_what_it_fills():
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1]], dtype=float)
+    wedge = np.array([[0, 1, 2, 3, 4, 5, 5, 4]])  # its upper side is an edge
+    assert meshes.tet_volumes(points, cells.tetrahedra("hexahedron", wedge)).sum() == pytest.approx(0.5)
+
+
+# --- formats ---
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.vtk", {}), ("a.vtu", {}), ("a.msh", {"file_format": "gmsh22"}), ("a.mesh", {})]
+)
+@pytest.mark.parametrize("binary", [True, False])
+def test_quads_beside_triangles(tmp_path, name, options, binary):
+    if name != "a.mesh":
+        options = {**options, "binary": binary}
+    mixed = [("quad", [[0, 1, 4, 3]]), ("triangle", [[1, 2, 5], [1, 5, 4]])]
+    meshio.Mesh(QUAD_AND_TRIANGLES, mixed).write(tmp_path / name, **options)
+    mesh = meshes.read(tmp_path / name)
+    assert (len(mesh.triangles), area(mesh), mesh.notes) == (4, pytest.approx(2.0), [])
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.vtk", {}), ("a.vtu", {}), ("a.msh", {"file_format": "gmsh22"}), ("a.mesh", {})]
+)
+def test_hexahedra_and_wedges_beside_tets(tmp_path, name, options):
+    points = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1, 2, 3)], dtype=float)
+    hexahedron = [0, 1, 5, 4, 8, 9, 13, 12]
+    wedges = [[1, 2, 6, 9, 10, 14], [1, 6, 5, 9, 14, 13]]
+    tets = generators.Box(size=(1, 1, 1), cells=(1, 1, 1)).mesh()
+    number = [int(np.argmin(np.abs(points - (vertex + np.array([2.5, 0.5, 0.5]))).sum(axis=1))) for vertex in tets.vertices]
+    mixed = [("hexahedron", [hexahedron]), ("wedge", wedges), ("tetra", np.array(number)[tets.tets])]
+    meshio.Mesh(points, mixed).write(tmp_path / name, **options)
+    mesh = meshes.read(tmp_path / name)
+    assert volume(mesh) == pytest.approx(3.0)
+    assert len(mesh.tets) == 6 + 6 + 6
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([3, 1, 1])
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("version", ["gmsh", "gmsh22"])
+def test_hexahedra_of_gmsh(tmp_path, binary, version):
+    points, given = box_cells("hexahedron", np.random.default_rng(0))
+    meshio.Mesh(points, [("hexahedron", given)]).write(tmp_path / "a.msh", file_format=version, binary=binary)
+    assert volume(meshes.read(tmp_path / "a.msh")) == pytest.approx(12.0)
+
+
+def test_cells_of_second_order_are_reduced_with_a_word(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    middles = [0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3))]
+    meshio.Mesh([*corners, *middles], [("tetra10", [list(range(10))])]).write(tmp_path / "a.msh", file_format="gmsh")
+    mesh = meshes.read(tmp_path / "a.msh")
+    assert (len(mesh.vertices), volume(mesh)) == (4, pytest.approx(1 / 6))
+    assert mesh.notes == ["cells of higher order were reduced to their corners: 1 tetra"]
+
+
+def test_faces_and_lines_that_bound_no_cell_are_said(tmp_path):
+    points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [5, 0, 0], [6, 0, 0], [5, 1, 0]]
+    mixed = [("tetra", [[0, 1, 2, 3]]), ("triangle", [[0, 2, 1], [4, 5, 6]]), ("line", [[0, 1], [4, 5], [5, 6]])]
+    meshio.Mesh(points, mixed).write(tmp_path / "a.vtu")
+    mesh = meshes.read(tmp_path / "a.vtu")
+    assert mesh.notes[0] == "1 faces that bound no cell were left out"
+    assert mesh.notes[1].startswith("2 lines were left out")
+
+
+GMSH_41 = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+1
+3 1 "vol"
+$EndPhysicalNames
+$Entities
+0 0 1 2
+1 0 0 0 1 1 1 0 0
+1 0 0 0 1 1 1 1 1 0
+2 0 0 0 1 1 1 0 0
+$EndEntities
+$Nodes
+2 5 1 9
+{block}
+3 2 0 1
+9
+1 1 1
+$EndNodes
+$Elements
+3 3 1 3
+2 1 2 1
+1 1 3 2
+3 1 4 1
+2 1 2 3 4
+3 2 4 1
+3 2 3 4 9
+$EndElements
+"""
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        "3 1 0 4\n1\n2\n3\n4\n0 0 0\n1 0 0\n0 1 0\n0 0 1",
+        "2 1 1 4\n1\n2\n3\n4\n0 0 0 .1 .2\n1 0 0 .3 .4\n0 1 0 .5 .6\n0 0 1 .7 .8",  # with parameters on a surface
+    ],
+)
+def test_gmsh_with_several_entities_of_which_one_has_a_name(tmp_path, block):
+    (tmp_path / "a.msh").write_text(GMSH_41.format(block=block))
+    mesh = meshes.read(tmp_path / "a.msh")
+    assert len(mesh.vertices) == 5
+    assert volume(mesh) == pytest.approx(1 / 6 + 1 / 3)
+
+
+def test_gmsh_2_with_parametric_nodes(tmp_path):
+    nodes = "1 0 0 0 0 1\n2 1 0 0 1 1 0.5\n3 0 1 0 2 1 0.5 0.5\n4 0 0 1 3 1"
+    (tmp_path / "a.msh").write_text(
+        f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$ParametricNodes\n4\n{nodes}\n$EndParametricNodes\n"
+        "$Elements\n2\n1 15 2 0 1 1\n2 4 2 0 1 1 2 3 4\n$EndElements\n"
+    )
+    assert volume(meshes.read(tmp_path / "a.msh")) == pytest.approx(1 / 6)
+
+
+def test_medit_with_line_breaks_anywhere(tmp_path):
+    (tmp_path / "a.mesh").write_text(
+        "MeshVersionFormatted 2\n\nDimension\n3\n# a comment 1 2 3\nVertices 4\n0 0 0 0\n1 0 0\n0 0 1 0 0\n0 0 1 0\n\n"
+        "Tetrahedra 1\n1 2 3 4 9\n\nCorners\n1\n1\nRequiredVertices\n1\n2\nEnd\n"
+    )
+    assert volume(meshes.read(tmp_path / "a.mesh")) == pytest.approx(1 / 6)
+
+
+def test_obj_indices_count_back_from_where_they_stand(tmp_path):
+    block = "v {0} 0 0\nv {1} 0 0\nv {1} 0 1\nf -3/1/1 -1//2 \\\n-2\n"
+    (tmp_path / "a.obj").write_text(block.format(0, 1) + block.format(2, 3))
+    mesh = meshes.read(tmp_path / "a.obj")
+    assert mesh.triangles.tolist() == [[0, 2, 1], [3, 5, 4]]
+    assert area(mesh) == pytest.approx(1.0)
+
+
+def test_sewing_lines_of_an_obj_are_said(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 1 0\nv 1 1 0\nv 1 1 1\nf 1 2 3\nf 4 5 6\nl 1 4\nl 2 5 6\n")
+    (note,) = meshes.read(tmp_path / "a.obj").notes
+    assert note.startswith("3 lines were left out") and "attachments" in note
+
+
+@pytest.mark.parametrize("order", ["<", ">", "text"])
+def test_ply_with_faces_of_several_sizes(tmp_path, order):
+    faces, extra = [[0, 3, 4, 1], [1, 4, 5], [1, 5, 2]], [[7], [], [1, 2]]
+    layout = {"<": "binary_little_endian", ">": "binary_big_endian", "text": "ascii"}[order]
+    head = (
+        f"ply\nformat {layout} 1.0\ncomment x\nelement vertex 6\nproperty float x\nproperty double y\nproperty float z\nproperty uchar red\n"
+        "element face 3\nproperty uchar flags\nproperty list uchar int vertex_indices\nproperty list uchar short more\nend_header\n"
+    )
+    with open(tmp_path / "a.ply", "wb") as file:
+        file.write(head.encode())
+        for x, y, z in QUAD_AND_TRIANGLES:
+            file.write(f"{x} {y} {z} 255\n".encode() if order == "text" else struct.pack(f"{order}fdfB", x, y, z, 255))
+        for face, more in zip(faces, extra, strict=True):
+            if order == "text":
+                file.write((" ".join(map(str, [3, len(face), *face, len(more), *more])) + "\n").encode())
+            else:
+                file.write(struct.pack(f"{order}BB{len(face)}iB{len(more)}h", 3, len(face), *face, len(more), *more))
+    mesh = meshes.read(tmp_path / "a.ply")
+    assert (len(mesh.triangles), area(mesh)) == (4, pytest.approx(2.0))
+
+
+def test_off_with_polygons_and_colours(tmp_path):
+    (tmp_path / "a.off").write_text(
+        "OFF # a comment\n6 3 0\n"
+        + "\n".join(" ".join(map(str, p)) for p in QUAD_AND_TRIANGLES)
+        + "\n\n4 0 3 4 1 255 0 0\n3 1 4 5\n3 1 5 2 0.1 0.2 0.3\n"
+    )
+    assert area(meshes.read(tmp_path / "a.off")) == pytest.approx(2.0)
+
+
+def test_vertices_on_others_are_merged_with_a_word(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nv 1 0 0\nv 0 0 1\nv 1 0 1.000000001\nf 1 2 3\nf 5 4 6\n")
+    mesh = meshes.read(tmp_path / "a.obj")
+    assert len(mesh.vertices) == 4
+    assert mesh.notes == ["2 vertices that lie exactly on others were merged with them"]
+
+
+# --- USD ---
+
+
+def stage(path, unit=None, axis=None):
+    usd, geometry = (
+        pytest.importorskip("pxr.Usd", reason='the extra "usd" is not installed'),
+        pytest.importorskip("pxr.UsdGeom"),
+    )
+    made = usd.Stage.CreateNew(str(path))
+    if unit:
+        geometry.SetStageMetersPerUnit(made, unit)
+    if axis:
+        geometry.SetStageUpAxis(made, axis)
+    return made, geometry
+
+
+def square(made, geometry, name, at=(0, 0, 0), side=1.0):
+    prim = geometry.Mesh.Define(made, name)
+    prim.CreatePointsAttr([(at[0] + x * side, at[1] + y * side, at[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    prim.CreateFaceVertexCountsAttr([4])
+    prim.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    return prim
+
+
+def test_all_meshes_of_usd_where_they_stand_in_metres_y_up(tmp_path):
+    made, geometry = stage(tmp_path / "a.usda", 0.01, "Z")
+    root = geometry.Xform.Define(made, "/root")
+    root.AddTranslateOp().Set((0, 0, 100))
+    root.AddScaleOp().Set((2, 2, 2))
+    square(made, geometry, "/root/a", side=50.0)
+    square(made, geometry, "/root/b", at=(100, 0, 0), side=50.0)
+    square(made, geometry, "/root/hidden", side=50.0).MakeInvisible()
+    geometry.Sphere.Define(made, "/root/ball")
+    geometry.Mesh.Define(made, "/root/off").GetPrim().SetActive(False)
+    made.Save()
+    mesh = meshes.read(tmp_path / "a.usda")
+    assert area(mesh) == pytest.approx(2.0)
+    assert mesh.vertices.min(axis=0) == pytest.approx([0, 1, -1]) and mesh.vertices.max(axis=0) == pytest.approx([3, 1, 0])
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    assert np.all(np.cross(b - a, c - a)[:, 1] > 0), "what faced up in z faces up in y"
+    assert mesh.notes == [
+        "its unit of 0.01 m was converted to m",
+        "its z axis, which points up, was turned to y",
+        "what is no Mesh was left out: 1 Sphere",
+        "1 invisible prims were left out",
+    ]
+
+
+def test_mirrors_holes_and_left_hands_of_usd(tmp_path):
+    made, geometry = stage(tmp_path / "a.usda", 1.0)
+    mirrored = square(made, geometry, "/mirrored")
+    mirrored.AddScaleOp().Set((-1, 1, 1))
+    square(made, geometry, "/left", at=(2, 0, 0)).CreateOrientationAttr(geometry.Tokens.leftHanded)
+    holed = square(made, geometry, "/holed", at=(4, 0, 0))
+    holed.GetFaceVertexCountsAttr().Set([3, 3])
+    holed.GetFaceVertexIndicesAttr().Set([0, 1, 2, 0, 2, 3])
+    holed.CreateHoleIndicesAttr([1])
+    made.Save()
+    mesh = meshes.read(tmp_path / "a.usda")
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    normal = np.cross(b - a, c - a)[:, 2] / 2
+    middle = (a + b + c)[:, 0] / 3
+    assert normal[middle < 0] == pytest.approx([0.5, 0.5]), "a mirror image keeps its outside"
+    assert normal[(middle > 2) & (middle < 4)] == pytest.approx([-0.5, -0.5])
+    assert normal[middle > 4] == pytest.approx([0.5])
+
+
+def test_usd_that_moves_or_has_no_unit_is_said(tmp_path):
+    made, geometry = stage(tmp_path / "a.usda")
+    points = square(made, geometry, "/a").GetPointsAttr()
+    later = [(x, y, 5) for x, y, _ in points.Get()]
+    points.Clear()
+    points.Set([(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], 3.0)
+    points.Set(later, 9.0)
+    made.Save()
+    mesh = meshes.read(tmp_path / "a.usda")
+    assert mesh.vertices[:, 2] == pytest.approx(1.0)
+    assert mesh.notes == [
+        "it does not say metersPerUnit: its numbers were taken as m",
+        "it moves or deforms at 2 times: it was read as it is at the first",
+    ]
+
+
+def test_a_glb_says_what_it_leaves_out(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    scene = trimesh.Scene()
+    box = trimesh.creation.box((1, 1, 1))
+    scene.add_geometry(box, node_name="one")
+    scene.add_geometry(box, node_name="two", transform=trimesh.transformations.translation_matrix([3, 0, 0]))
+    scene.add_geometry(trimesh.load_path(np.array([[[0, 0, 0], [1, 0, 5.0]]])))
+    scene.export(tmp_path / "a.glb")
+    mesh = meshes.read(tmp_path / "a.glb")
+    assert (len(mesh.vertices), area(mesh)) == (16, pytest.approx(12.0))
+    assert mesh.notes == ["1 lines or clouds of points were left out"]
+
+
+# --- the process that reads what others parse ---
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('(1 "meshio 5.3.5")\n(2 3)\n(10 (0 1 1b 0))\n(12 (0 1 30 0))\n(301', "took more than 1 s"),
+        ("nonsense", "cannot be read as .msh"),
+    ],
+)
+def test_parsers_that_never_end_are_ended(tmp_path, monkeypatch, text, message):
+    monkeypatch.setattr(worker, "SECONDS", 1.0)
+    (tmp_path / "a.msh").write_text(text)
+    begun = time.monotonic()
+    with pytest.raises(SceneError, match=message) as caught:
+        meshes.read(tmp_path / "a.msh")
+    assert str(tmp_path / "a.msh") in str(caught.value)
+    assert time.monotonic() - begun < 30.0
+
+
+def test_one_process_reads_many_files_and_goes_on_after_a_failure(tmp_path, monkeypatch):
+    monkeypatch.setattr(worker, "SECONDS", 1.0)
+    meshio.Mesh(QUAD_AND_TRIANGLES, [("triangle", [[1, 2, 5]])]).write(tmp_path / "good.vtu")
+    (tmp_path / "bad.vtu").write_text("nonsense")
+    (tmp_path / "endless.msh").write_text("(10 (0 1 1b 0))\n(301")
+    with worker.Worker() as reader:
+        first = meshes.read(tmp_path / "good.vtu", reader)
+        process = reader.process
+        for name in ("bad.vtu", "endless.msh"):
+            with pytest.raises(SceneError):
+                meshes.read(tmp_path / name, reader)
+        again = meshes.read(tmp_path / "good.vtu", reader)
+    assert np.array_equal(first.vertices, again.vertices)
+    assert process.poll() is not None and reader.process is None, "none is left behind"
+
+
+def test_bytes_that_are_no_text_are_an_error_with_the_place(tmp_path):
+    pytest.importorskip("pxr", reason='the extra "usd" is not installed')
+    (tmp_path / "a.usda").write_bytes(b'#usda 1.0\ndef Mesh "m"\n{\n    point3f[] points = [(0, 0, \xff\xfe0)]\n}\n')
+    with pytest.raises(SceneError, match=r"cannot be read as \.usda: .*a\.usda:4"):
+        meshes.read(tmp_path / "a.usda")
