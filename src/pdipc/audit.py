@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from pdipc.device.launch import one_at_a_time
-from pdipc.work import Work
 from pdipc.model import Model, State, build
 from pdipc.output.results import Run
 from pdipc.scene.schema import Scene
+from pdipc.work import Work
 
 
 @dataclass

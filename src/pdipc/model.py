@@ -216,9 +216,9 @@ def build(scene: Scene, device: str | None = None) -> Model:
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)
     free[assembly.kinematic_vertices] = False
-    sets, mass = elasticity(assembly)
-    mass = np.where(free, mass, 0.0)
     nonlinear = _nonlinear_solver(scene)
+    sets, mass = elasticity(assembly, nonlinear == "newton")
+    mass = np.where(free, mass, 0.0)
     held = mass * (1.0 / (h * h) + sim.damping / h)
     for s in sets:
         if s.kind == "point_attachment":
@@ -331,20 +331,23 @@ def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
     return float(np.sqrt(of.membrane_stiffness / of.areal_density))
 
 
-def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The projective constraints of all bodies (Section 3) and the lumped masses (n,) kg."""
+def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+    """The constraints of all bodies (Section 3) and the lumped masses (n,) kg. newton: for that solver, see `SolidMaterial.model`."""
     x, n = assembly.rest_positions, len(assembly.positions)
     sets, mass = [], np.zeros(n)
     for body in assembly.bodies:
         m = body.material
         if isinstance(m, SolidMaterial):
             strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
-            if m.model == "arap":
+            model = m.model
+            if model == "auto":
+                model = "neo_hookean" if newton else "arap"
+            if model == "arap":
                 sets.append(tet_strain.rest(x, body.tets, strain))
                 if volume > 0.0:
                     sets.append(tet_volume.rest(x, body.tets, volume))
             else:
-                kind = corotated if m.model == "corotated" else neo_hookean
+                kind = corotated if model == "corotated" else neo_hookean
                 sets.append(kind.rest(x, body.tets, 0.5 * strain, volume / 3.0))
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
         elif isinstance(m, ClothMaterial):

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import warp as wp
 
-from pdipc import algorithm
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.collision.candidates import Candidates
 from pdipc.collision.truncation import Truncation

@@ -270,9 +270,13 @@ def kernels(real: Real) -> SimpleNamespace:
                     u = a[0] * p0 + a[1] * p1 + a[2] * p2 + a[3] * p3
                     across = -c * (u - wp.dot(normals[k], u) * normals[k])
                     g = first_bent[k]
-                    response[1] = c * (wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3))
+                    response[1] = c * (
+                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+                    )
                     g = second_bent[k]
-                    response[2] = c * (wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3))
+                    response[2] = c * (
+                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+                    )
                 response_out[k] = response
                 across_out[k] = across
 
@@ -370,7 +374,7 @@ def coupling(real: Real) -> wp.Kernel:
 
     scalar, vec3 = real.scalar, real.vec3
     f, k_of = rigid_modes.functions(real), kernels(real)
-    row, mat43, vec6 = k_of.row, k_of.mat43, f.vec6
+    row, mat43, _vec6 = k_of.row, k_of.mat43, f.vec6
 
     @wp.kernel(module=real.module(f"{__name__}.coupling"))
     def couple(

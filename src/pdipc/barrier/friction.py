@@ -184,9 +184,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += weights[k][entries[i] % 4] * response[k]
             y[v] = y[v] + total
 
-    return SimpleNamespace(
-        copy=copy, copy_ends=copy_ends, evaluate=evaluate, gather=gather, stretch=stretch, spread=spread
-    )
+    return SimpleNamespace(copy=copy, copy_ends=copy_ends, evaluate=evaluate, gather=gather, stretch=stretch, spread=spread)
 
 
 class FrictionTerm:

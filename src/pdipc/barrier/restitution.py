@@ -170,7 +170,11 @@ def kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def move(
-        first: int, x: wp.array(dtype=vec3), free: wp.array(dtype=scalar), p: wp.array(dtype=vec3), x_now_out: wp.array(dtype=vec3)
+        first: int,
+        x: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        p: wp.array(dtype=vec3),
+        x_now_out: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
         x_now_out[i] = x[i] + free[i] * p[i]

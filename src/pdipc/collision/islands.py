@@ -45,7 +45,13 @@ def kernels(real: Real):
                     near_out[wp.max(a, b) * bodies + wp.min(a, b)] = 1
 
     @wp.kernel(module=module)
-    def label(first: int, bodies: int, fixed: wp.array(dtype=wp.int32), near: wp.array(dtype=wp.int32), label_out: wp.array(dtype=wp.int32)):
+    def label(
+        first: int,
+        bodies: int,
+        fixed: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
+        label_out: wp.array(dtype=wp.int32),
+    ):
         """The least body of each body's island; fixed: what attachments join from the start."""
         for a in range(bodies):
             label_out[a] = fixed[a]

@@ -294,7 +294,19 @@ class Truncation:
         def sweep() -> None:
             device.launch(k.reset, n, [self.multiplier, self.any_hit])
             for c in candidates.lists:
-                inputs = [c.count, x, self.x_end, self.fraction, self.passes, c.quads, c.limits, self.body, c.times, c.found, self.deep]
+                inputs = [
+                    c.count,
+                    x,
+                    self.x_end,
+                    self.fraction,
+                    self.passes,
+                    c.quads,
+                    c.limits,
+                    self.body,
+                    c.times,
+                    c.found,
+                    self.deep,
+                ]
                 device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
                 inputs = [c.count, c.quads, c.times, c.found, self.multiplier, self.any_hit]
                 device.launch_scatter(k.spread, c.capacity, inputs)

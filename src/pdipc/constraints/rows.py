@@ -34,7 +34,9 @@ def keep_length(real: Real) -> Callable:
     return project
 
 
-def kernels(real: Real, module: wp.Module, corners: int, project_of: Callable[[Real], Callable], bends: bool = True) -> SimpleNamespace:
+def kernels(
+    real: Real, module: wp.Module, corners: int, project_of: Callable[[Real], Callable], bends: bool = True
+) -> SimpleNamespace:
     """Force and energy; project_of(real) makes project(G x, length), the local projection.
 
     bends: whether the projection depends on G x; without, the Hessian is w G^T G, which does not change, and no kernel is made.

@@ -56,7 +56,7 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """Deformation gradients, and blocks of the Hessian."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    _scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
     eig, rot = eigen.functions(real), rotation.functions(real)
 

@@ -86,7 +86,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     W_11, W_12, W_22, then what it costs to twist, to flip, and per axis to tilt out of the plane, W_i / s_i.
     """
     scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
-    mat23 = wp.types.matrix((2, 3), scalar)
+    wp.types.matrix((2, 3), scalar)
     project, wide_project = project_of(real), project_of(real_of("float64"))
     f_of, normal = functions(real), normal_function(real)
     zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
@@ -194,13 +194,13 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         w = weight[e]
         k = w * k
         t = pair[0]
-        l = pair[1]
+        flip = pair[1]
         if project[0] != 0:
             t = wp.max(t, zero)
-            l = wp.max(l, zero)
+            flip = wp.max(flip, zero)
             tilt = vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
-        p = half * w * (l + t)
-        q = half * w * (l - t)
+        p = half * w * (flip + t)
+        q = half * w * (flip - t)
         out = w * tilt
         g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
         g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])

@@ -14,6 +14,7 @@ LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, FIRST_NUMBER = (wp.constant(status.COUNTS + 
 TIMES = wp.constant(status.COUNTS + 4 + status.NUMBERS)
 SIZE = status.COUNTS + 4 + status.NUMBERS + len(status.STAGES)
 
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3

@@ -84,7 +84,9 @@ class BlockPcg:
             c.apply(p, self._w)
         self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
         self._precondition()
-        sums.conclude(k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite])
+        sums.conclude(
+            k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite]
+        )
 
         def iterate() -> None:
             for c in contacts:
@@ -289,4 +291,12 @@ def kernels(real: Real) -> SimpleNamespace:
                 gamma += wp.dot(residual, u)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(clear=clear, invert_diagonal=invert_diagonal, start=start, begin=begin, find_alpha=find_alpha, multiply=multiply, correct=correct)
+    return SimpleNamespace(
+        clear=clear,
+        invert_diagonal=invert_diagonal,
+        start=start,
+        begin=begin,
+        find_alpha=find_alpha,
+        multiply=multiply,
+        correct=correct,
+    )

@@ -141,7 +141,7 @@ class RigidModes:
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """What gathers into C. A group's row of 6x6 blocks is written by its own worker only."""
-    scalar, vec3 = real.scalar, real.vec3
+    _scalar, vec3 = real.scalar, real.vec3
     vec6 = wp.types.vector(MODES, wp.float64)
 
     @wp.func
@@ -170,8 +170,8 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = functions(real)
     vec6 = f.vec6
-    mat63 = wp.types.matrix((MODES, 3), wp.float64)
-    wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
+    wp.types.matrix((MODES, 3), wp.float64)
+    wide, _wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
 
     @wp.func_native(_FACTORIZE)
     def factorize_rows(

@@ -33,12 +33,18 @@ from pdipc.linear.blocks import BlockMatrix
 from pdipc.nonlinear import status
 from pdipc.nonlinear.sums import BodySums
 
-FRICTION_LAGS = 12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
+FRICTION_LAGS = (
+    12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
+)
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 DRIVES = 24  # outer iterations in which scripted vertices go on to their targets, at most
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
-SLACK = {"float32": 4.0e-7, "float64": 1.0e-12}  # of the potential: a rise that rounding makes
+SLACK = {
+    "float32": 4.0e-7,
+    "float64": 1.0e-12,
+}  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
+KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -148,6 +154,7 @@ def kernels(real: Real) -> SimpleNamespace:
         base_new: wp.array(dtype=wide),
         friction_new: wp.array(dtype=wide),
         overflow: wp.array(dtype=wp.int32),
+        negligible: wide,
         before: wp.array(dtype=wide),
         after: wp.array(dtype=wide),
         squeezed: wp.array(dtype=wp.int32),
@@ -173,7 +180,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for b in range(bodies):
             island = label[b]
             ok = accepted_out[island]
-            if after[island] <= before[island] + slack * wp.abs(before[island]) or attempts[0] > HALVINGS:
+            if after[island] <= before[island] + slack * wp.abs(before[island]) + negligible or attempts[0] > HALVINGS:
                 ok = 1
             if squeezed[island] != 0 and attempts[0] == 0:
                 ok = 0
@@ -314,12 +321,21 @@ def kernels(real: Real) -> SimpleNamespace:
         hits: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
+        tolerance: scalar,
         project_out: wp.array(dtype=wp.int32),
+        renew_out: wp.array(dtype=wp.int32),
     ):
-        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads."""
+        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads. Elastic
+        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last.
+        """
         project_out[0] = 1
+        renew = int(1)
         if count[status.OUTER] > 0 and hits[0] == 0 and attempts[0] == 1:
             project_out[0] = 0
+            if renew_out[0] == 1 and numbers[status.MOVED] <= scalar(KEEP) * tolerance:
+                renew = int(0)
+        renew_out[0] = renew
 
     @wp.kernel(module=module)
     def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
@@ -482,9 +498,17 @@ class Newton:
         self.before, self.after = zeros(wp.float64, self.bodies), zeros(wp.float64, self.bodies)
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
-        self.attempts, self.searching, self.hits, self.drive, self.lagging, self.crowded, self.still, self.project = (
-            zeros(wp.int32, 1) for _ in range(8)
-        )
+        (
+            self.attempts,
+            self.searching,
+            self.hits,
+            self.drive,
+            self.lagging,
+            self.crowded,
+            self.still,
+            self.project,
+            self.renew,
+        ) = (zeros(wp.int32, 1) for _ in range(9))
         self.pairs.project = self.project
         self.largest = Reducer(device, real, n)
         lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
@@ -542,11 +566,15 @@ class Newton:
     def freeze(self) -> None:
         """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
         w = self.work
-        self.device.launch_serial(self.kernels.choose, [self.hits, self.attempts, w.count, self.project])
+        self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
             self.device.when(self._lags_now(), self.friction.lag)
             self.friction.differentiate(w.u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
+
+    def _last(self) -> list:
+        """What is known of the last outer iteration."""
+        return [self.hits, self.attempts, self.work.count, self.numbers, self.model.real.scalar(self.model.settings.tolerance)]
 
     def _lags_now(self) -> wp.array:
         self.device.launch_serial(_positive(self.model.real), [self.lagging, self.searching])
@@ -559,6 +587,7 @@ class Newton:
         friction = None if self.friction is None else self.friction.force_of_vertex
         where = [w.u, w.x_start, w.target, model.free, self.drive]
         device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        device.when(self.renew, self._assemble)
         self._solve_linear()
         device.when(self.solver.indefinite, self._solve_projected)
         inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial]
@@ -567,10 +596,12 @@ class Newton:
         self.largest.max(self.forces, self.numbers, status.FORCE)
         self.largest.max(self.scales, self.numbers, status.FORCE_SCALE)
 
+    def _assemble(self) -> None:
+        self.matrix.assemble(self.work.x_start, self.work.u, self.project)
+        self.solver.prepare(self.work.x, self._contacts())
+
     def _solve_linear(self) -> None:
-        w, contacts = self.work, self._contacts()
-        self.matrix.assemble(w.x_start, w.u, self.project)
-        self.solver.prepare(w.x, contacts)
+        contacts = self._contacts()
         self.solver.solve(self.p, self.rhs, contacts, self.tolerated)
 
     def _solve_projected(self) -> None:
@@ -580,6 +611,7 @@ class Newton:
         self.device.launch(k.restart, self.model.vertex_count, [self.model.free, self.p])
         if self.friction is not None:
             self.friction.differentiate(w.u, self.project)
+        self._assemble()
         self._solve_linear()
 
     def correct(self, r: Restitution) -> None:
@@ -588,7 +620,11 @@ class Newton:
         self.device.launch_serial(self.kernels.set_flag, [self.project])
         self.matrix.assemble(w.x_start, w.u, self.project)
         r.linearize_exact(w.rest)
-        self.device.launch(self.kernels.begin, n, [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p])
+        self.device.launch(
+            self.kernels.begin,
+            n,
+            [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
+        )
         self.solver.prepare(w.x, [self.pairs])
         self.solver.solve(self.p, r.zero, [self.pairs], 0.0)
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
@@ -596,7 +632,14 @@ class Newton:
 
     def accept(self) -> None:
         """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
-        w, k, device, n, model, t = self.work, self.kernels, self.device, self.model.vertex_count, self.model, self.work.truncation
+        w, k, device, n, model, t = (
+            self.work,
+            self.kernels,
+            self.device,
+            self.model.vertex_count,
+            self.model,
+            self.work.truncation,
+        )
         device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts])
         self.islands.find(w.candidates)
         device.launch_serial(k.clear_motion, [w.count])
@@ -604,7 +647,14 @@ class Newton:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
         self._evaluate(t.u_end, t.x_end)
-        energies = [self.base_old, self.friction_old, self.base_new, self.friction_new, w.candidates.overflow]
+        energies = [
+            self.base_old,
+            self.friction_old,
+            self.base_new,
+            self.friction_new,
+            w.candidates.overflow,
+            self.tolerated**2,
+        ]
         judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.searching]
         judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
         device.launch_serial(k.judge, judging)

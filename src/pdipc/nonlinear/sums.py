@@ -1,6 +1,7 @@
 """Energies by body: sums of fixed blocks, so that they depend neither on threads nor on what other bodies do."""
 
 import functools
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -60,7 +61,7 @@ class BodySums:
             owner = np.asarray(owner)
             change = np.flatnonzero(np.diff(owner)) + 1
             runs = np.concatenate([[0], change, [len(owner)]]).astype(np.int64)
-            starts = np.concatenate([np.arange(low, high, BLOCK) for low, high in zip(runs[:-1], runs[1:], strict=True)] or [[]])
+            starts = np.concatenate([np.arange(low, high, BLOCK) for low, high in itertools.pairwise(runs)] or [[]])
             starts = starts.astype(np.int64)
             ends = np.minimum(starts + BLOCK, runs[np.searchsorted(runs, starts, side="right").clip(max=len(runs) - 1)])
             inside = owner[starts] >= 0 if len(starts) else np.zeros(0, dtype=bool)

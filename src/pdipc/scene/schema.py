@@ -320,10 +320,11 @@ class SolidMaterial(Table):
     density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
     young_modulus: Positive = Field(default=1e5, le=1e12, description="Young's modulus, Pa.")
     poisson_ratio: Real = Field(default=0.4, ge=0, le=0.499, description="Poisson's ratio.")
-    model: Literal["arap", "corotated", "neo_hookean"] = Field(
-        default="arap",
+    model: Literal["auto", "arap", "corotated", "neo_hookean"] = Field(
+        default="auto",
         description="The elastic energy; all are Hooke's law for small strains. arap: the paper's constraints of strain and volume; "
-        "corotated and neo_hookean stay smooth where elements are flattened or inverted, and need the Newton solver.",
+        "corotated and neo_hookean stay smooth where elements are flattened or inverted, and need the Newton solver. auto: "
+        "neo_hookean with the Newton solver, else arap.",
     )
 
 
