@@ -19,6 +19,9 @@ from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import RigidModes
 
 
+LOOSE = 10.0  # how much less exact a solve is that is far from the end
+
+
 class Coupling(Protocol):
     """What contact adds to the matrix, low-rank terms pair by pair."""
 
@@ -70,15 +73,16 @@ class BlockPcg:
         if self.modes.groups:
             self.modes.prepare(x, contacts)
 
-    def solve(self, p: wp.array, b: wp.array, contacts: list[Coupling], tolerated: float) -> None:
+    def solve(self, p: wp.array, b: wp.array, contacts: list[Coupling], tolerated: float, loose: wp.array) -> None:
         """Launches the solution of K p = b. p: (n,) vec3, m; the start on entry, the solution on return; entries that are not free stay.
 
-        tolerated: N^(1/2) m^(1/2), the norm below which a residual is as good as none.
+        tolerated: N^(1/2) m^(1/2), the norm below which a residual is as good as none. loose: (1,) int32 on the device, whether LOOSE times the
+        tolerance will do.
         """
         k, sums, m = self._kernels, self.sums, self.matrix
         rows = [m.offsets, m.columns, m.values, m.held]
         status = [self._first, self._left, self.iterations, self._residual, self._going]
-        limits = [self.real.scalar(self.tolerance), self.most]
+        limits = [loose, self.real.scalar(self.tolerance), self.most]
         self.device.launch(k.clear, m.count, [self._w])
         for c in contacts:
             c.apply(p, self._w)
@@ -95,7 +99,7 @@ class BlockPcg:
             sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])
             sums.launch(self._advance, [self._numbers, 1, self._w, self._u, self._p, self._s, p, self._r])
             self._precondition()
-            sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits, *status])
+            sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits[1:], *status])
 
         self.device.loop(self._going, iterate)
 
@@ -192,6 +196,7 @@ def kernels(real: Real) -> SimpleNamespace:
         slots: int,
         numbers: wp.array(dtype=scalar),
         tolerated: scalar,
+        loose: wp.array(dtype=wp.int32),
         tolerance: scalar,
         most: int,
         first_out: wp.array(dtype=scalar),
@@ -208,7 +213,10 @@ def kernels(real: Real) -> SimpleNamespace:
             numbers[pcg.BETA] = scalar(0.0)
             numbers[pcg.GAMMA] = gamma
             norm = wp.sqrt(gamma)
-            reference = wp.max(norm, tolerated / tolerance)
+            reference = norm
+            if loose[0] != 0:
+                reference = scalar(LOOSE) * norm
+            reference = wp.max(reference, tolerated / tolerance)
             first_out[0] = reference
             left_out[0] = most
             residual_out[0] = norm / reference

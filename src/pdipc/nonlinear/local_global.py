@@ -85,6 +85,12 @@ def kernels(real: Real) -> SimpleNamespace:
         code = int(status.RUNNING)
         residual = numbers[status.MOVED]
         waits = count[status.BEHIND] > 0 and count[status.OUTER] % 2 == 1  # see commit
+        # the first motion says nothing of how fast they shrink
+        ratio = scalar(0.99)
+        if count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        numbers[status.MOVED_BEFORE] = residual
         count[status.BEHIND] = 0
         if overflow[0] != 0:
             code = status.OVERFLOW
@@ -96,7 +102,7 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.BARRIERS] = pairs[0]
             if passes[0] > 0:
                 count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
-            settled = passes[0] == 0 and not waits and residual <= tolerance
+            settled = passes[0] == 0 and not waits and left <= tolerance
             if settled:
                 code = status.CONVERGED
             elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:

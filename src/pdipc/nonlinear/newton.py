@@ -602,7 +602,7 @@ class Newton:
 
     def _solve_linear(self) -> None:
         contacts = self._contacts()
-        self.solver.solve(self.p, self.rhs, contacts, self.tolerated)
+        self.solver.solve(self.p, self.rhs, contacts, self.tolerated, self.project)
 
     def _solve_projected(self) -> None:
         """Anew, with every element's Hessian positive semidefinite."""
@@ -626,7 +626,7 @@ class Newton:
             [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
         )
         self.solver.prepare(w.x, [self.pairs])
-        self.solver.solve(self.p, r.zero, [self.pairs], 0.0)
+        self.solver.solve(self.p, r.zero, [self.pairs], 0.0, self.still)
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
 

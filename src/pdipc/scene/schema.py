@@ -86,7 +86,7 @@ class Simulation(Table):
         "(inner_iterations, linear_solver, linear_iterations, linear_tolerance, solver_order, solver_drop) is given.",
     )
     max_outer: Whole = Field(
-        default=50,
+        default=100,
         ge=1,
         le=10**6,
         description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
