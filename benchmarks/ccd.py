@@ -10,8 +10,8 @@ and optionally `xi`. One CPU thread, kernels only, all in one run. Writes benchm
 
 The second writes such a FILE: all pairs that the last step of a bundled scene's first N asks about.
 
-The third asks N queries of every family in tests/contact/hard_queries.py, both kinds, float64 and float32, with and without a
-minimum separation, and has each answer proven by an independent judge (tests/contact/exact.py). It must end with "late: 0".
+The third asks N queries of every family in tests/collision/hard_queries.py, both kinds, float64 and float32, with and without a
+minimum separation, and has each answer proven by an independent judge (tests/collision/exact.py). It must end with "late: 0".
 """
 
 import argparse
@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(REPOSITORY / "tests"))
 
-from contact import exact, hard_queries  # noqa: E402
+from collision import exact, hard_queries  # noqa: E402
 
 from pdipc.collision import ccd, queries  # noqa: E402
 from pdipc.device import precision  # noqa: E402
@@ -295,7 +295,7 @@ def verdicts() -> dict[str, dict[str, int]]:
         content = np.load(file)
         points, hit = content["x"], content["hit"].copy()
         if file.stem == "fast-root-counterexample_ee":
-            hit[:] = False  # its edges pass 5e-7 apart: tests/contact/test_time_of_impact.py
+            hit[:] = False  # its edges pass 5e-7 apart: tests/collision/test_time_of_impact.py
         total["hits"] += int(hit.sum())
         total["misses"] += int((~hit).sum())
         answers = {

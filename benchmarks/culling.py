@@ -75,8 +75,7 @@ def measure(frame: str, triangles: int) -> list[dict]:
         skin = surface.build(device, faces, x0, body, np.zeros(len(x0), bool))
         arrays = [wp.array(v, dtype=number.vec3, device="cpu") for v in (x0, x1)] + [wp.array(reach, dtype=wp.float64)]
         near = sieve.functions(number).Sieve()
-        near.begin, near.end, near.reach = arrays[0], arrays[1], 2 * float(reach[0])
-        near.half_separation = wp.zeros(len(x0), dtype=wp.float64)
+        near.begin, near.end, near.reach = arrays
         for method in ("patches", "bvh"):
             start = time.perf_counter()
             search = broad_phase.BroadPhase(device, number, skin, method)

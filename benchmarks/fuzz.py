@@ -29,9 +29,11 @@ import numpy as np
 import pdipc
 from pdipc.scene import check, generators, meshes, worker
 from pdipc.scene.errors import SceneError
+from pdipc.scene.frames import read_frames
 
+CACHES = (".npz", ".usda", ".usdc")  # formats that hold frames
 LIMIT = 60  # s for one input
-STEPPED = 5  # one in so many of the scenes that are found good is simulated for a step
+STEPPED = 20  # one in so many of the scenes that are found good is simulated for a step
 worker.SECONDS = 2.0  # for the damaged files on which parsers of other packages never end
 
 HOSTILE_WORDS = [
@@ -83,9 +85,13 @@ def scenes() -> list[dict]:
         for k, shape in enumerate(("box", "sphere", "cylinder", "capsule", "torus", "grid"))
     ]
     shapes[0]["mesh"]["cells"] = [1, 2, 1]
+    frames = [[[x, y - 20, z] for x, y, z in square] for y in (0.0, 0.1)]
+    arrays = {"vertices": frames[0], "triangles": [[0, 1, 2], [1, 3, 2]]}
+    deforming = {"name": "d", "mesh": arrays, "motion": {"cache": {"vertices": frames, "times": [0.0, 0.5]}, "start": 0.01}}
+    stairs = {"name": "o", "mesh": {"shape": "stairs", "steps": 2}, "translation": [0, -9, 0]}
     return [
         whole,
-        {"bodies": shapes, "obstacles": [{"name": "o", "mesh": {"shape": "stairs", "steps": 2}, "translation": [0, -9, 0]}]},
+        {"bodies": shapes, "obstacles": [stairs, deforming]},
     ]
 
 
@@ -117,6 +123,7 @@ def mesh_files(folder: Path) -> list[Path]:
     surface.export(folder / "b.stl", file_type="stl_ascii")
     np.savez(folder / "a.npz", V=ball.vertices, T=ball.tets)
     np.savez_compressed(folder / "b.npz", V=ball.vertices, F=ball.triangles)
+    np.savez(folder / "c.npz", V=np.stack([skin.vertices, 2 * skin.vertices]), F=skin.triangles, times=[0.0, 1.0])
     nodes = "\n".join(f"{k} {x:.17g} {y:.17g} {z:.17g}" for k, (x, y, z) in enumerate(ball.vertices))
     elements = "\n".join(f"{k} {' '.join(map(str, tet))}" for k, tet in enumerate(ball.tets))
     (folder / "a.node").write_text(f"{len(ball.vertices)} 3 0 0\n{nodes}\n")
@@ -131,6 +138,7 @@ def mesh_files(folder: Path) -> list[Path]:
             root.AddScaleOp().Set((2, 2, 2))
             prim = UsdGeom.Mesh.Define(stage, "/root/m")
             prim.CreatePointsAttr([tuple(map(float, point)) for point in skin.vertices])
+            prim.GetPointsAttr().Set([tuple(map(float, 2 * point)) for point in skin.vertices], 5.0)
             prim.CreateFaceVertexCountsAttr([3] * len(skin.triangles))
             prim.CreateFaceVertexIndicesAttr([int(k) for k in skin.triangles.ravel()])
             stage.Save()
@@ -257,7 +265,12 @@ def judge_scene(source, rng: np.random.Generator) -> str:
             return "refused"
     if rng.integers(STEPPED) == 0:
         scene.simulation.substeps = 1
-        pdipc.Simulation(scene, "cpu").step()
+        sim = pdipc.Simulation(scene, "cpu")
+        sim.step()
+        if not np.isfinite(sim.positions).all():
+            return "foreign positions that are not finite"
+        if len(pdipc.find_intersections(sim.positions, sim.triangles, sim.model.assembly.obstacle)):
+            return "foreign intersections"
         return "simulated"
     return "read"
 
@@ -277,7 +290,10 @@ def judge(
             for partner in {".node": [".ele"], ".ele": [".node"]}.get(good.suffix, []):
                 source.with_suffix(partner).write_bytes(good.with_suffix(partner).read_bytes())
             kind = good.suffix
-            meshes.read(source, reader)
+            if good.suffix not in CACHES or rng.integers(2):
+                meshes.read(source, reader)
+            else:
+                read_frames(str(source), 25.0 if rng.integers(2) else None, reader)
             return kind, "read", source
         scene = tables[rng.integers(len(tables))]
         if kind == "python":

@@ -45,8 +45,10 @@ def scene(substeps: int) -> pdipc.Scene:
 
 def start(arguments: list[str], log: Path, largest_file: int | None = None) -> int:
     """`pdipc ...` in a fork; its process number."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # until the child has come to where an interrupt ends it alone
     child = os.fork()
     if child:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         return child
     code = 70
     try:
@@ -56,6 +58,7 @@ def start(arguments: list[str], log: Path, largest_file: int | None = None) -> i
         if largest_file is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
         pdipc.simulation.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         app(arguments)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(bool(end.code))
@@ -203,9 +206,9 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
             differs = said or judge(run, expected[number])
             if differs:
                 wrong += 1
-                print(f"{kind}, run {i} of seed {seed}: {differs}\n{log.read_text()[-2000:]}", flush=True)
+                print(f"{kind}, run {i} of seed {seed}: {differs}\n{log.read_text()[-2000:] if log.exists() else ''}", flush=True)
             shutil.rmtree(run, ignore_errors=True)
-            log.unlink()
+            log.unlink(missing_ok=True)
         failures += wrong
         print(
             f"{kind:8} {count} runs, {wrong} differ from one that nothing stopped; {time.monotonic() - began:.0f} s", flush=True

@@ -2,7 +2,7 @@
 
 It looks for a direction n on which the two primitives stay apart at both ends of an interval of time. Vertices move
 linearly, so then they stay apart in between. An interval for which no n is found is halved. `stays_apart` first lets NumPy
-prove what it can, with a margin far above its rounding, and gives the rest to `pdipc.judge.exact`, where nothing rounds.
+prove what it can, with a margin far above its rounding, then in extended precision, and gives the rest to `pdipc.judge.exact`, where nothing rounds.
 """
 
 import numpy as np
@@ -11,8 +11,8 @@ from pdipc.judge.exact import distance_squared, stays_apart_exactly
 
 __all__ = ["candidates", "differences", "distance_squared", "stays_apart", "stays_apart_exactly"]
 
-LEVELS = 25  # halvings before whole numbers take over
-MARGIN = 64 * 2.0**-53
+LEVELS, MOST = 25, 500  # halvings, and intervals of one query, before whole numbers take over
+MARGIN = 32  # roundings (of numbers above one) that a proof leaves room for
 
 
 def differences(points: np.ndarray, kind: str) -> np.ndarray:
@@ -28,40 +28,72 @@ def stays_apart(points: np.ndarray, kind: str, times: np.ndarray, separation: fl
     """(n,) whether the distance is proven to stay above `separation` for all t in [0, times]."""
     separation = np.broadcast_to(np.asarray(separation, dtype=float), len(points))
     points, times = np.asarray(points, dtype=float), np.asarray(times, dtype=float)
-    q = differences(points, kind)
-    size = np.abs(q).max(axis=(1, 2, 3))
-    open_ = np.zeros(len(q), dtype=bool)
-    query, low, high = np.arange(len(q)), np.zeros(len(q)), times.copy()
-    for _ in range(LEVELS):
-        proven, hopeless = np.zeros(len(query), dtype=bool), np.zeros(len(query), dtype=bool)
-        for chunk in np.array_split(np.arange(len(query)), max(1, len(query) // 50_000)):
-            ends = q[query[chunk]]
-            found = _separated(ends, kind, low[chunk], high[chunk], separation[query[chunk]], size[query[chunk]])
-            proven[chunk], hopeless[chunk] = found
-        open_[query[hopeless]] = True
-        keep = ~proven & ~open_[query]
-        query, low, high = query[keep], low[keep], high[keep]
-        middle = 0.5 * (low + high)
-        query, low, high = np.tile(query, 2), np.concatenate([low, middle]), np.concatenate([middle, high])
-    open_[query] = True
-    result = ~open_
-    for i in np.flatnonzero(open_):
+    result = np.zeros(len(points), dtype=bool)
+    doubtful = np.arange(len(points))
+    for number in (np.float64, np.longdouble):
+        result[doubtful] = _proven(points[doubtful], kind, times[doubtful], separation[doubtful], number)
+        doubtful = doubtful[~result[doubtful]]
+    for i in doubtful:
         result[i] = stays_apart_exactly(points[i], kind, times[i], separation[i]) is True
     return result
 
 
+def _proven(points, kind, times, separation, number) -> np.ndarray:
+    """(n,) what the rounded arithmetic of `number` proves."""
+    with np.errstate(all="ignore"):
+        q = differences(points.astype(number), kind)
+    size, separation = np.abs(q).max(axis=(1, 2, 3)), separation.astype(number)
+    open_ = np.zeros(len(q), dtype=bool)
+    query, low, high = np.arange(len(q)), np.zeros(len(q), dtype=number), times.astype(number)
+    for _ in range(LEVELS):
+        if not len(query):
+            break
+        proven, hopeless = np.zeros(len(query), dtype=bool), np.zeros(len(query), dtype=bool)
+        for chunk in np.array_split(np.arange(len(query)), max(1, len(query) // 20_000)):
+            ends = q[query[chunk]]
+            found = _separated(ends, kind, low[chunk], high[chunk], separation[query[chunk]], size[query[chunk]])
+            proven[chunk], hopeless[chunk] = found
+        open_[query[hopeless]] = True
+        open_ |= np.bincount(query, minlength=len(q)) > MOST
+        keep = ~proven & ~open_[query]
+        query, low, high = query[keep], low[keep], high[keep]
+        middle = (low + high) / 2
+        query, low, high = np.tile(query, 2), np.concatenate([low, middle]), np.concatenate([middle, high])
+    open_[query] = True
+    return ~open_
+
+
+def estimate(points: np.ndarray, kind: str, t: float) -> np.ndarray:
+    """(n,) the distance at time t, about."""
+    ends = differences(np.asarray(points, dtype=float), kind)
+    q = ends[:, 0] + t * (ends[:, 1] - ends[:, 0])
+    best = np.zeros(len(q))
+    with np.errstate(all="ignore"):
+        for n in candidates(q, kind):
+            n = n / np.sqrt(np.einsum("ni,ni->n", n, n))[:, None]
+            best = np.fmax(best, np.einsum("ni,nki->nk", n, q).min(axis=1))
+    return best
+
+
+def along_axes(points: np.ndarray, kind: str) -> np.ndarray:
+    """(n,) the gap of the boxes of the two primitives along the axis where it is greatest, of the lesser of both ends, about."""
+    q = differences(np.asarray(points, dtype=float), kind)
+    return np.maximum(q.min(axis=(1, 2)), (-q).min(axis=(1, 2))).max(axis=1)
+
+
 def _separated(q, kind, low, high, separation, size) -> tuple[np.ndarray, np.ndarray]:
     """Which intervals are proven, and which are hopeless: no direction separates at the middle by more than the margin."""
+    margin = MARGIN * np.finfo(q.dtype).eps
 
     def at(t):
         return q[:, 0] + t[:, None, None] * (q[:, 1] - q[:, 0])
 
-    begin, middle, end = at(low), at(0.5 * (low + high)), at(high)
+    begin, middle, end = at(low), at((low + high) / 2), at(high)
     proven, hopeless = np.zeros(len(q), dtype=bool), np.ones(len(q), dtype=bool)
     with np.errstate(all="ignore"):
         for n in candidates(middle, kind):
-            length = np.sqrt(np.einsum("ni,ni->n", n, n)) * (1 + MARGIN)
-            over = separation * length + MARGIN * np.abs(n).sum(axis=1) * size
+            length = np.sqrt(np.einsum("ni,ni->n", n, n)) * (1 + margin)
+            over = separation * length + margin * np.abs(n).sum(axis=1) * size
             least = [np.einsum("ni,nki->nk", n, points).min(axis=1) for points in (begin, middle, end)]
             valid = (length > 1e-140) & np.isfinite(length)
             proven |= valid & (np.minimum(least[0], least[2]) > over)

@@ -178,3 +178,79 @@ FAMILIES = (
     specks,
     rotating,
 )
+
+
+# --- pairs that culling is asked about, and wants to leave out: as above, but near the edge of what it may leave out ---
+
+
+def ridges(rng, n):
+    """Long edges that cross at 1e-9 to 1e-3 rad, a gap of 1e-13 to 1e-3 of their length apart, and what lies beside them."""
+    x = np.stack([-1 + rng.uniform(-0.3, 0.3, n), 1 + rng.uniform(-0.3, 0.3, n)], axis=1)
+    angle, gap = _powers(rng, n, -9, -3), _powers(rng, n, -13, -3)
+    cross = rng.uniform(-1, 1, n) * (rng.random(n) < 0.5)
+    start = np.zeros((n, 4, 3))
+    start[:, :2, 0] = x
+    start[:, 2:, 0] = x[:, ::-1] * rng.choice([-1, 1], (n, 1)) + rng.uniform(-0.3, 0.3, (n, 2))
+    start[:, 2:, 2] = (start[:, 2:, 0] - cross[:, None]) * angle[:, None]
+    start[:, 2:, 1] = gap[:, None]
+    # for a vertex and a triangle: a vertex over a needle
+    middle = 0.5 * (start[:, :1] + start[:, 1:2])
+    needle = rng.random(n) < 0.5
+    start[needle, 0] = (middle + rng.uniform(-0.2, 0.2, (n, 1, 1)) * (start[:, 1:2] - middle))[needle, 0]
+    start = _turned(rng, start)
+    move = np.where(rng.random(n) < 0.5, 0.0, gap * _powers(rng, n, -2, 1))
+    return _motion(rng, start, move)
+
+
+def needles(rng, n):
+    """Triangles of a width of 1e-12 to 1e-3 of their length, with a vertex or an edge over them at about that height."""
+    thin = _powers(rng, n, -12, -3)[:, None]
+    start = rng.uniform(-1, 1, (n, 4, 3))
+    start[:, 3] = start[:, 2] + thin * rng.normal(size=(n, 3))
+    along = rng.uniform(0, 1, (n, 1))
+    over = (1 - along) * start[:, 1] + along * start[:, 2]
+    start[:, 0] = over + thin * 10.0 ** rng.uniform(-3, 3, (n, 1)) * rng.normal(size=(n, 3))
+    return _motion(rng, start, np.where(rng.random(n) < 0.5, 0.0, thin[:, 0] * _powers(rng, n, -2, 1)))
+
+
+def very_far(rng, n):
+    """1e5 to 1e9 m from the origin, of 1e-3 to 1e3 m, near each other and moving together, apart or not at all."""
+    size = _powers(rng, n, -3, 3)[:, None, None]
+    points = size * hits(rng, n)
+    away = rng.normal(size=(n, 1, 3)) * _powers(rng, n, 5, 9)[:, None, None]
+    journey = np.zeros((n, 8, 3))
+    journey[:, 4:] = away * rng.uniform(-1, 1, (n, 1, 1)) * (rng.random((n, 1, 1)) < 0.5)
+    return points + away + journey
+
+
+def tiny_beside_huge(rng, n):
+    """One primitive of 1e-6 to 1e-2 near another of 1 to 1e4, its vertices led away by 0 to 1e5."""
+    points = hits(rng, n)
+    center = _before(points, 0.0)[:, :1]
+    first = np.where(rng.random((n, 1)) < 0.5, [1, 1, 0, 0], [1, 0, 0, 0])
+    first = np.tile(first, (1, 2))[:, :, None]
+    tiny, huge = _powers(rng, n, -6, -2)[:, None, None], _powers(rng, n, 0, 4)[:, None, None]
+    points = (points - center) * np.where(first > 0, tiny, huge)
+    led = rng.integers(0, 8, n)
+    points[np.arange(n), led] += rng.normal(size=(n, 3)) * np.where(rng.random(n) < 0.5, 0.0, _powers(rng, n, 0, 5))[:, None]
+    return points
+
+
+def extreme(rng, n):
+    """As large, or as small, as numbers get: 1e-320 to 1e300 (1e-44 to 1e36 once rounded to float32), all vertices or some."""
+    points = np.where(rng.random((n, 1, 1)) < 0.5, hits(rng, n), ridges(rng, n))
+    single = rng.random(n) < 0.5
+    exponent = np.where(single, rng.uniform(-44, 36, n), rng.uniform(-320, 300, n))
+    other = np.where(rng.random(n) < 0.5, exponent, rng.uniform(-44, 36, n))
+    vertex = np.tile(rng.random((n, 4)) < 0.5, (1, 2))
+    with np.errstate(under="ignore"):
+        return points * 10.0 ** np.where(vertex, exponent[:, None], other[:, None])[:, :, None]
+
+
+def _turned(rng, points):
+    """Each turned its own way."""
+    q, _ = np.linalg.qr(rng.normal(size=(len(points), 3, 3)))
+    return points @ q.transpose(0, 2, 1)
+
+
+CULLING = (ridges, needles, very_far, tiny_beside_huge, extreme)

@@ -28,3 +28,13 @@ def test_one_huge_box_among_many_small_ones():
     low = np.random.default_rng(0).random((20_000, 3))
     pairs = boxes.overlapping(low, low + 1e-3, np.array([[-1e3] * 3]), np.array([[0.5] * 3]))
     assert set(pairs[:, 0]) == set(np.flatnonzero(np.all(low <= 0.5, axis=1)))
+
+
+def test_parts_are_bounded_however_many_pairs_there_are():
+    """Every box meets every other one."""
+    low = np.random.default_rng(2).uniform(0.0, 1.0, (1500, 3))
+    count = 0
+    for part in boxes.parts(low, low + 2.0, low, low + 2.0):
+        assert len(part) <= boxes.PART + len(low)
+        count += len(part)
+    assert count == len(low) ** 2

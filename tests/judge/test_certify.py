@@ -67,8 +67,10 @@ def test_obstacles_may_meet_each_other(tmp_path):
 
 def test_a_broken_record_is_refused(tmp_path):
     runs.write(tmp_path / "run", steps=4)
-    certificate = certify(open_run(tmp_path / "run"))
+    told = []
+    certificate = certify(open_run(tmp_path / "run"), progress=lambda *done: told.append(done))
     assert (certificate.segments, certificate.hits) == (4, [])
+    assert told == [(1, 1), (2, 2), (3, 3), (4, 4)]
     (tmp_path / "run/segments/000002_0000.npz").unlink()
     with pytest.raises(RunError, match="broken at step 3"):
         certify(open_run(tmp_path / "run"))

@@ -1,6 +1,7 @@
 """The witness against fractions, against ipctk, and on the cases where floating point is in doubt."""
 
 import itertools
+import tracemalloc
 from fractions import Fraction
 
 import numpy as np
@@ -143,3 +144,18 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="vertices 0 to 3; there are 0 to 2"):
         find_intersections(TRIANGLE, [[0, 1, 3]])
     assert find_intersections(TRIANGLE, np.zeros((0, 3), int)).shape == (0, 2)
+
+
+def test_memory_does_not_grow_with_the_pairs_that_come_near():
+    """A stack of sheets, tilted, so that all boxes overlap: four million pairs, of which none meet."""
+    sheets = 600
+    corners = np.array([[0, 0, 0], [1, 0, 1], [1, 1, 2], [0, 1, 1]], dtype=np.float64)
+    positions = np.concatenate([corners + np.array([0, 0, 1e-3 * k]) for k in range(sheets)])
+    triangles = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * k for k in range(sheets)])
+    tracemalloc.start()
+    try:
+        assert len(find_intersections(positions, triangles)) == 0
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 60e6

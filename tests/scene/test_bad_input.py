@@ -166,6 +166,20 @@ def test_positions_that_overflow_are_said_beside_what_else_is_wrong():
     assert "velocities of 9 vertices are beyond 1e+09 m/s" in str(fast[0])
 
 
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"keyframes": [{"time": 0}, {"time": 1, "translation": [1e30, 0, 0]}]},
+        {"velocity": [0, 1e300, 0]},
+        {"angular_velocity": [0, 1e308, 1e308]},
+    ],
+)
+def test_motions_that_lead_out_of_all_bounds(motion):
+    plane = {"name": "o", "mesh": {"shape": "plane"}, "translation": [0, -1, 0], "motion": motion}
+    (finding,) = check.check(pdipc.Scene(bodies=[cloth()], obstacles=[plane]))
+    assert finding.where == 'obstacle "o"' and "its motion leads" in str(finding) and "within 1e+09 m" in str(finding)
+
+
 def test_check_scene_finds_in_one_pass_what_tables_and_what_geometry_have_wrong(tmp_path):
     (tmp_path / "a.toml").write_text(
         "titel = 1\n[simulation]\nsteps = -1\n"

@@ -197,6 +197,18 @@ def test_a_run_with_a_cache_resumes_to_the_same_bits(tmp_path):
     assert certify(pdipc.open_run(tmp_path / "whole")).hits == []
 
 
+def test_triangles_that_open_later_stay():
+    closed = SHEET.vertices.copy()
+    closed[24] = closed[25]
+    cache = {"vertices": np.stack([closed, SHEET.vertices, closed]), "times": [0, 1, 2]}
+    whole = assembly.assemble(scene(cache))
+    assert len(whole.bodies[1].triangles) == len(SHEET.triangles)
+    assert check.check(scene(cache)) == []
+    cache["vertices"] = np.stack([closed] * 3)
+    with pytest.warns(pdipc.scene.errors.SceneWarning, match="2 triangles without an area were left out"):
+        assembly.assemble(scene(cache))
+
+
 def test_a_cloth_caught_between_parts_that_close_is_held_and_what_closes_lags():
     """Two plates of one obstacle close on a cloth until they would overlap: no vertex is shot away, nothing meets."""
     n = len(SHEET.vertices)

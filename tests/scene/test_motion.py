@@ -34,6 +34,26 @@ def test_keyframes_are_met_and_joined_by_straight_lines_and_even_turns():
     assert path.apply(POINT, 99.0) == pytest.approx(np.array([[0, 1, 0]]))
 
 
+@pytest.mark.parametrize("degrees", [90.0, 270.0, 720.0, -540.0])
+def test_turns_between_keyframes_are_as_many_as_are_given(degrees):
+    motion = Motion(keyframes=[Keyframe(time=0), Keyframe(time=2, rotation=(0, degrees, 0))])
+    path = Trajectory(motion, np.zeros(3))
+    for part in (0.1, 0.25, 0.5, 0.9):
+        angle = np.radians(part * degrees)
+        assert path.apply(POINT, 2 * part) == pytest.approx(np.array([[np.cos(angle), 0, -np.sin(angle)]]))
+
+
+def test_turns_may_be_the_shortest():
+    turned = Keyframe(time=1, rotation=(0, 270, 0))
+    path = Trajectory(Motion(keyframes=[Keyframe(time=0), turned], turns="shortest"), np.zeros(3))
+    assert path.apply(POINT, 0.5) == pytest.approx(np.array([[0.5**0.5, 0, 0.5**0.5]])), "by 90 degrees the other way"
+    # evenly about one axis: half of the way is half of the angle, whatever the axis
+    end = Keyframe(time=1, rotation=(50, -70, 100))
+    path = Trajectory(Motion(keyframes=[Keyframe(time=0), end], turns="shortest"), np.zeros(3))
+    half, whole = path.pose(0.5)[0], path.pose(1.0)[0]
+    assert half @ half == pytest.approx(whole)
+
+
 def test_a_single_keyframe_is_a_pose():
     path = Trajectory(Motion(keyframes=[Keyframe(time=5, translation=(1, 2, 3))]), np.zeros(3))
     assert path.apply(POINT, 0.0) == pytest.approx(np.array([[2, 2, 3]]))

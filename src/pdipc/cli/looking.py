@@ -117,12 +117,21 @@ def view(
     host: Annotated[str, typer.Option(help='Who may watch: "localhost", or "0.0.0.0" for other machines too.')] = "localhost",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page; if it is taken, the next free one.")] = 8080,
     device: Annotated[str | None, typer.Option(help='"cpu" or "cuda:0".')] = None,
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-origin", metavar="ORIGIN", help="A page elsewhere that may connect too, such as https://host:8443."
+        ),
+    ] = None,
 ) -> None:
-    """Watch a run, or a scene while it is simulated, in the browser; there, bodies can be dragged with the mouse."""
+    """Watch a run, or a scene while it is simulated, in the browser; there, bodies can be dragged with the mouse.
+
+    The address that is printed has a token in it, which is new each time: whoever has it may watch and drag.
+    """
     from pdipc import viewer
     from pdipc.output.results import open_run
 
     if Path(what).is_dir():
-        viewer.play(open_run(what), host, port)
+        viewer.play(open_run(what), host, port, allow or ())
     else:
-        viewer.simulate(load(what), host, port, device)
+        viewer.simulate(load(what), host, port, device, allow or ())

@@ -169,7 +169,7 @@ def _bar(total: int) -> Iterator[Callable[["StepInfo"], None]]:
 
         def compiled(modules: int) -> None:
             if modules == 1:
-                bar.console.print("compiling kernels: about a minute, once; they are kept for later runs")
+                bar.console.print("compiling kernels, once; they are kept for later runs")
             bar.update(task, told=f"{modules} modules of kernels compiled")
 
         with _told_of_compiling(compiled):

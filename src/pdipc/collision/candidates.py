@@ -2,6 +2,21 @@
 
 A list of candidates stays in use for as long as every vertex stays near an end of the motion that the list was made for: some
 outer iterations and, at rest, many steps. Culling then costs one comparison a vertex.
+
+**Lemma (reuse).** A list that was made for the motion y(s) = (1 - s) y(0) + s y(1) of all vertices holds for a motion x(t) = (1 - t) x(0) +
+t x(1) if all of x(0) are within the margin of the same end y(s0), s0 = 0 or 1, and all of x(1) of the same end y(s1). Proof: x(t) - y((1 -
+t) s0 + t s1) = (1 - t) (x(0) - y(s0)) + t (x(1) - y(s1)) for every vertex, which is no longer than the margin; so at every t all vertices
+are within it of y at one common fraction. For a pair that is not listed the two primitives of y are there, all the way, farther apart
+than reach_i + reach_j, with reach = half of the separation and half of the activation distance and the margin: so those of x stay
+farther apart than the separation xi and the activation distance. Where *some* vertices of x(0) are near the one end and some near the other,
+nothing of this holds, and `check` asks for a new list: it counts who is away from each end, and asks that nobody is.
+
+**Rounding.** What CCD and barriers take for xi, d_hat and the length of a stray is off by a few units in the last place of the scene's
+precision, below 1e-6 relative, and so is a reach. The reach that pairs are listed by has (1 + ROUNDING) on it, which is ten times that.
+A stray is measured in double precision; where a margin is below LEAST_MARGIN, where its square would underflow, nothing is near.
+
+What happens between two primitives that are farther apart than xi + d_hat all the way: nothing. Barriers act nearer than d_hat beyond xi
+(`barrier.pairs`), and CCD shortens a motion only where a gap falls to xi + s min(d(0) - xi, d_hat) at most, s < 1 (`ccd`).
 """
 
 import functools
@@ -17,6 +32,8 @@ from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
+ROUNDING = 1.0e-5  # relative, of all that a reach is made of
+LEAST_MARGIN = 1.0e-100  # m
 REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as minimum separation, at most
 
 
@@ -25,6 +42,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
     module = real.module(__name__)
     dist = distance.functions(real)
+    least_margin = wp.constant(wp.float64(LEAST_MARGIN))
 
     @wp.func
     def limits(a: int, b: int, rest_distance: scalar, half_separation: wp.array(dtype=scalar), d_hat: scalar, same: bool):
@@ -91,6 +109,11 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(4):
             away_out[i] = 0
 
+    @wp.func
+    def near(x: vec3, y: vec3, margin: scalar) -> bool:
+        """A comparison with NaN is false: what is not known to be near is away."""
+        return wp.length(dist.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
+
     @wp.kernel(module=module)
     def depart(
         first: int,
@@ -103,14 +126,14 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """away[0] and [1]: whether any x0 is more than the margin away from `begin`, and from `end`; away[2] and [3]: any x1."""
         i = first + wp.tid()
-        # whoever writes, writes the same; a comparison with NaN is false: not near is away
-        if not (wp.length(x0[i] - begin[i]) <= margin):
+        # whoever writes, writes the same
+        if not near(x0[i], begin[i], margin):
             away[0] = 1
-        if not (wp.length(x0[i] - end[i]) <= margin):
+        if not near(x0[i], end[i], margin):
             away[1] = 1
-        if not (wp.length(x1[i] - begin[i]) <= margin):
+        if not near(x1[i], begin[i], margin):
             away[2] = 1
-        if not (wp.length(x1[i] - end[i]) <= margin):
+        if not near(x1[i], end[i], margin):
             away[3] = 1
 
     @wp.kernel(module=module)
@@ -191,13 +214,12 @@ class Candidates:
         self.rest = wp.array(rest_positions, dtype=real.vec3, device=device.warp)
         self.begin = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
-        reach = half_separation.numpy() + (0.5 * activation_distance + margin)
+        reach = (half_separation.numpy().astype(float) + (0.5 * activation_distance + margin)) * (1.0 + ROUNDING)
         self.reach = wp.array(reach, dtype=real.scalar, device=device.warp)
         self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
         self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.sieve = sieve.functions(real).Sieve()
-        self.sieve.begin, self.sieve.end, self.sieve.half_separation = self.begin, self.end, half_separation
-        self.sieve.reach = activation_distance + 2.0 * margin
+        self.sieve.begin, self.sieve.end, self.sieve.reach = self.begin, self.end, self.reach
         self.overflow = broad_phase.overflow
         self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
         self.vertex_triangle, self.edge_edge = self.lists
@@ -213,8 +235,8 @@ class Candidates:
 
     def invalidate(self) -> None:
         """Forgets the list: the next `check` asks for a new one."""
-        self.begin.fill_(1.0e30)
-        self.end.fill_(1.0e30)
+        self.begin.fill_(wp.nan)
+        self.end.fill_(wp.nan)
 
     def restructure(self, x: wp.array) -> None:
         """Renews the structures of the culling around x; what they find does not depend on it."""

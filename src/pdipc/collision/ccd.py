@@ -18,7 +18,8 @@ largest area, the distance exceeds g (`cubic`). Its root from below is where the
 
 **Lemma 2 (rounding).** Coordinates are scaled so that all components of q_k are at most 1 in size; u = 2^-53. A computed q_k is
 off by 2u a component (difference, scaling), n . q_k by at most (2 + 3) sqrt(3) u < 9u, its value at t by 9u more; |n| is off
-by 3u relative, and the crossing time by 3u of a slope below 3.5. Together this is below 50u. SLACK = 64u is taken off.
+by 3u relative, and the crossing time by 3u of a slope below 3.5. Together this is below 50u. SLACK = 64u is taken off. Where the
+largest component is not between SMALLEST and LARGEST, so that it cannot be scaled, the time is 0.
 
 All of this is in double precision, whatever the precision of the scene: differences of float32 coordinates are exact there,
 or nearly so, and a float32 scene is as safe as a float64 one. What comes before is a reject in the scene's own precision,
@@ -27,7 +28,10 @@ which is where nearly all candidates end: Lemma 1 over [0, 1] with the three axe
 **Lemma 3 (reject).** With components of q_k at most Q and u the unit roundoff of the scene, a computed n . q_k is off by at
 most u |n|_1 Q for the differences and 3u |n|_1 Q for the sum. For edges, n . (b_j - a_1) is n . (b_j - a_0) less
 n . (a_1 - a_0): 15u |n|_1 Q. What is made of it before it is compared adds 4u |n|_1 Q. REJECT_SLACK = 24u |n|_1 Q is taken off,
-at the start and once more for the least of both ends. On an axis nothing rounds but the difference, by u relative.
+at the start and once more for the least of both ends. On an axis nothing rounds but the difference, by u relative. Two computed
+numbers of which one is greater are so before their last rounding, even where that under- or overflows; so what counts in over^2 >
+near^2 |n|^2 is the underflow of near^2 alone, by 2^-150 in float32, and the slack that is not needed, 5u Q twice, is more: |n|^2 > small_sq
+takes Q > 2e-16, so (5u Q)^2 > 2^-148. In float64 both are farther apart.
 
 **Target.** The gap to keep is g = xi + s min(d(0) - xi, reach), s = `backoff`, since the barrier needs room. A time is good
 enough, and returned, when the gap there is below xi + 1.5 s min(d(0) - xi, reach). When iterations run out, or no direction
@@ -50,6 +54,7 @@ STOP = 1.5
 NEVER = 2.0
 TOLERANCE = 0.05  # of the volume at the start: where the cubic's iteration ends
 ALIGNED = 1.0e-14  # squared sine of two edges below which their normal is not trusted first
+SMALLEST, LARGEST = 1.0e-300, 1.0e300  # m, of a difference
 DIRECTIONS = 3  # choices of n that are tried before giving up
 
 
@@ -262,6 +267,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     rounding_down = wp.constant(wide(1.0 - 4.0 * real.unit_roundoff))
     smallest = wp.constant(wide(1.0e-30))  # below, a float32 loses digits
     shortest_sq = wp.constant(wide(1.0e-280))  # below, a square does
+    least_size, most_size = wp.constant(wide(SMALLEST)), wp.constant(wide(LARGEST))
 
     @wp.func
     def relative(x: vec3, origin: vec3) -> wide3:
@@ -286,7 +292,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
                 wp.max(wp.max(wp.max(wp.abs(p0), wp.abs(p1)), wp.max(wp.abs(p2), wp.abs(p3)))),
                 wp.max(wp.max(wp.max(wp.abs(r0), wp.abs(r1)), wp.max(wp.abs(r2), wp.abs(r3)))),
             )
-            if not size > zero:
+            if not (size > least_size and size < most_size):
                 return zero
             scale = one / size
             p0 *= scale

@@ -1,4 +1,17 @@
-"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full."""
+"""What both ways of culling share: boxes of moving vertices, and lists of pairs that say when they are full.
+
+**Lemma 1 (moving boxes).** Let thing A stay within (1 - s) a(0) + s a(1) at every fraction s of the way, a box at the begin and one at
+the end, and B within b(s) likewise. If the least of a is above the greatest of b along one axis at s = 0 and at s = 1, it is in between,
+since both are linear in s; so A and B never share a point. A box around several holds each at both ends, so it holds each all the way:
+what is apart from a node of a tree is apart from all below it, and from all of a patch.
+
+**Lemma 2 (rounding).** A corner is x - reach or x + reach, rounded to double precision, clamped to +-FARTHEST, and rounded to float32, as
+Warp's trees are. Each of these maps is monotone, and the same for all corners. So a corner that is above another one after them, not
+equal to it, is above it in real arithmetic: no rounding makes a gap where there is none, and nothing has to be rounded outward. Minima,
+maxima and comparisons of corners, which is all that happens to them here, in `patches` and in Warp's trees, do not round. The clamp keeps
+the sums and areas that a tree makes finite; what is farther out meets all that is, and the sieve decides. A box of something that is
+there is never empty, and an empty one, from +inf to -inf, is apart from all. So boxes hold for all finite coordinates.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -12,11 +25,12 @@ from pdipc.device.precision import Real
 SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
 FIRST_PAIRS = 1024  # room of a list at first
 LARGEST_LIST = 2**31 - 1
+FARTHEST = 1.0e18  # m
 
 
 @wp.struct
 class Boxes:
-    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32, rounded outward.
+    """Boxes of things that move in straight lines, where the motion begins and where it ends; float32.
 
     At a fraction s of the way a thing is inside the box (1 - s) begin + s end.
     """
@@ -68,7 +82,7 @@ def join(a: Box, b: Box) -> Box:
 
 @wp.func
 def meet(a: Box, b: Box) -> bool:
-    """Whether they overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other."""
+    """Whether they may overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other (Lemma 1)."""
     for axis in range(3):
         if a.begin_low[axis] > b.begin_high[axis] and a.end_low[axis] > b.end_high[axis]:
             return False
@@ -80,7 +94,7 @@ def meet(a: Box, b: Box) -> bool:
 def boxes(count: int, device: Device) -> Boxes:
     """Room for `count` boxes; each is empty, and meets nothing."""
     made = Boxes()
-    for name, value in (("begin_low", 3e38), ("begin_high", -3e38), ("end_low", 3e38), ("end_high", -3e38)):
+    for name, value in (("begin_low", np.inf), ("begin_high", -np.inf), ("end_low", np.inf), ("end_high", -np.inf)):
         setattr(made, name, wp.full(max(1, count), wp.vec3(value, value, value), dtype=wp.vec3, device=device.warp))
     return made
 
@@ -89,18 +103,18 @@ def boxes(count: int, device: Device) -> Boxes:
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
-    # Boxes are float32, as Warp's trees are. One rounding errs by less than 6e-8 of the coordinate; this is outward of that.
-    outward = wp.constant(1.2e-7)
+    wide = wp.float64
+    farthest = wp.constant(wide(FARTHEST))
 
     @wp.func
-    def below(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f - outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) - wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
-
-    @wp.func
-    def above(v: vec3) -> wp.vec3:
-        f = wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
-        return f + outward * wp.vec3(wp.abs(f[0]), wp.abs(f[1]), wp.abs(f[2])) + wp.vec3(1.0e-30, 1.0e-30, 1.0e-30)
+    def corner(x: vec3, reach: wide) -> wp.vec3:
+        """x + reach, by the maps of Lemma 2."""
+        v = wp.vec3d(wide(x[0]) + reach, wide(x[1]) + reach, wide(x[2]) + reach)
+        return wp.vec3(
+            wp.float32(wp.clamp(v[0], -farthest, farthest)),
+            wp.float32(wp.clamp(v[1], -farthest, farthest)),
+            wp.float32(wp.clamp(v[2], -farthest, farthest)),
+        )
 
     @wp.kernel(module=module)
     def vertex_boxes(
@@ -111,11 +125,11 @@ def kernels(real: Real) -> SimpleNamespace:
         boxes_out: Boxes,
     ):
         i = first + wp.tid()
-        r = vec3(reach[i], reach[i], reach[i])
-        boxes_out.begin_low[i] = below(x0[i] - r)
-        boxes_out.begin_high[i] = above(x0[i] + r)
-        boxes_out.end_low[i] = below(x1[i] - r)
-        boxes_out.end_high[i] = above(x1[i] + r)
+        r = wide(reach[i])
+        boxes_out.begin_low[i] = corner(x0[i], -r)
+        boxes_out.begin_high[i] = corner(x0[i], r)
+        boxes_out.end_low[i] = corner(x1[i], -r)
+        boxes_out.end_high[i] = corner(x1[i], r)
 
     @wp.kernel(module=module)
     def settle(

@@ -88,7 +88,7 @@ def kernels(real: Real) -> SimpleNamespace:
     passes = sieve.functions(real)
     Sieve = passes.Sieve
     width = wp.constant(WIDTH)
-    nowhere = wp.constant(3.0e38)
+    nowhere = wp.constant(wp.inf)
 
     @wp.func
     def store_in_block(boxes: wp.array(dtype=wp.float32), slot: int, box: Box):
@@ -417,7 +417,7 @@ class PatchCulling:
             m = Members()
             m.start, m.home = upload(self.starts[kind], wp.int32), upload(homes[kind], wp.int32)
             m.inside, m.moving = upload(inside[kind], wp.uint32), upload(moving[kind], wp.uint32)
-            nowhere = np.tile(np.repeat(np.float32([3e38, -3e38]), 3 * WIDTH), 2)
+            nowhere = np.tile(np.repeat(np.float32([np.inf, -np.inf]), 3 * WIDTH), 2)
             m.boxes = upload(np.tile(nowhere, count if kind else 0), wp.float32)
             self.members.append(m)
 

@@ -5,6 +5,13 @@ that meet are shortened by the pair's time, candidates are listed again where th
 was made for, and the pass is repeated with a smaller back-off until one finds no hit: that pass proves the positions that are
 committed.
 
+**Lemma (the last pass).** After it no two primitives come nearer than xi while all vertices move from x to x_end. Proof: x_end are the float
+positions that are committed, and CCD was asked about just these. A pair that has a shortened vertex is asked in every pass, if it
+is listed; a pair without one makes the motion of the first pass, where it was not hit, or all its vertices would be shortened; it was
+listed there, or proven apart all the way. A pair that is not listed is apart by the lemmas of `candidates`, since the list was made for
+this motion or one that `check` compared with it. Where the passes do not settle nobody moves, and x is feasible. Times only choose what to
+try: no rounding in them, in fractions or in x + f (x~ - x) matters.
+
 The paper truncates every vertex by the one smallest time (`per_vertex=False`): correct, but one collision anywhere then
 drags every body of the scene (docs/paper_map.md).
 """

@@ -80,7 +80,7 @@ class Device:
 
     @one_at_a_time
     def __init__(self, name: str | None = None, threads: int | None = None):
-        wp.init()
+        system.start_warp()
         if name is None:
             name = "cuda:0" if wp.is_cuda_available() else "cpu"
         try:

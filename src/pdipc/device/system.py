@@ -1,4 +1,5 @@
-"""What kernels on the CPU ask of the operating system: to wait for each other, and the time.
+"""What stands between Warp and the operating system: its start, and what kernels on the CPU ask for, to wait for each other and the
+time.
 
 Native snippets cannot include headers, and what symbols they find differs between systems. So the functions are found from Python
 and go into kernels as addresses.
@@ -6,8 +7,10 @@ and go into kernels as addresses.
 
 import ctypes
 import functools
+import os
 import platform
 import sys
+import tempfile
 import time
 from typing import Any
 
@@ -103,6 +106,28 @@ def clock_call() -> tuple[wp.uint64, wp.int64]:
         ctypes.windll.kernel32.QueryPerformanceFrequency(ctypes.byref(frequency))
         return _address(ctypes.windll.kernel32.QueryPerformanceCounter), wp.int64(frequency.value)
     return _address(ctypes.CDLL(None).clock_gettime), wp.int64(time.CLOCK_MONOTONIC)
+
+
+NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+
+
+@functools.cache
+def start_warp() -> None:
+    """Starts Warp, without what it writes to stderr at every start on a machine that has no CUDA: that is no fault."""
+    try:
+        stderr = os.dup(2)
+    except OSError:  # there is none
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            said.seek(0)
+            os.write(2, b"".join(line for line in said if NO_DRIVER not in line))
 
 
 MEETING = 64  # int32 that threads meet in: four counters, each in a cache line of its own

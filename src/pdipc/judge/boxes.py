@@ -11,7 +11,7 @@ PART = 1 << 17  # pairs, and places where pairs may be, that are looked at toget
 def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.ndarray) -> np.ndarray:
     """All (i, j) for which closed box i of a and box j of b share a point: (k, 2) int64, in no particular order.
 
-    low and high: (n, 3) finite corners.
+    low and high: (n, 3) corners, at most 1e300 in size.
     """
     return np.concatenate([np.zeros((0, 2), dtype=np.int64), *parts(low_a, high_a, low_b, high_b)])
 
@@ -21,6 +21,11 @@ def parts(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.n
 
     A hierarchy of grids: each box lives in the grid whose cells are just larger than it, so that it touches at most eight; a pair meets
     in the coarser grid of the two.
+
+    Exact: corners are only compared. Cell numbers round, but are monotone in the coordinate: the greater of two low corners, in each
+    coordinate, is a point of both boxes of a pair that meets, and its cell is between the first and the last of both. A box is at most
+    a cell wide, less 1e-9 of it, and there are at most 2^18 cells, where a number rounds by 6e-11: so it reaches from its first cell
+    to the next one at most.
     """
     if len(low_a) == 0 or len(low_b) == 0:
         return

@@ -1,8 +1,10 @@
 """Linear motions of two primitives, judged in whole numbers, where nothing rounds. Slow, and the last word.
 
 The search is for a direction n on which the two primitives stay apart at both ends of an interval of time. Vertices move
-linearly, so then they stay apart in between. An interval for which no n is found is halved. No code is shared with what is
-judged.
+linearly, so then they stay apart in between. Where a pair turns, another proof holds for longer: the volume of the four vertices
+over the area that two of their differences span is the distance of two planes, or lines, that hold the primitives. Both are
+polynomials of time, which their Bernstein coefficients bound. An interval for which neither is found is halved. No code is
+shared with what is judged.
 """
 
 from fractions import Fraction
@@ -84,6 +86,29 @@ def _separates(n, q, bound_num, bound_den) -> bool:
     return least > 0 and least * least * bound_den > bound_num * _dot(n, n)
 
 
+def _planes_apart(begin, end, kind, bound_num, bound_den) -> bool:
+    """Whether the planes, or lines, of the two primitives stay farther apart than sqrt(bound_num / bound_den) from begin to end."""
+
+    def spans(q):
+        a, b, c = q[:3]
+        return (_minus(b, a), _minus(c, a), a) if kind == "vertex_triangle" else (_minus(a, c), _minus(b, a), a)
+
+    (u0, v0, w0), (u1, v1, w1) = spans(begin), spans(end)
+    first, last = _cross(u0, v0), _cross(u1, v1)
+    middle = tuple(x + y for x, y in zip(_cross(u0, v1), _cross(u1, v0), strict=True))
+    # six times the Bernstein coefficients of the volume, and of the area
+    volume = (
+        6 * _dot(first, w0),
+        2 * (_dot(middle, w0) + _dot(first, w1)),
+        2 * (_dot(last, w0) + _dot(middle, w1)),
+        6 * _dot(last, w1),
+    )
+    if not (min(volume) > 0 or max(volume) < 0):
+        return False
+    area = max(36 * _dot(first, first), 9 * _dot(middle, middle), 36 * _dot(last, last))
+    return min(map(abs, volume)) ** 2 * bound_den > bound_num * area
+
+
 def stays_apart_exactly(points: np.ndarray, kind: str, time: float, separation: float = 0.0) -> bool | None:
     """Whether the distance of one query stays above `separation` in [0, time]; None where this is not decided."""
     motion, last = Motion(points, kind), Fraction(float(time))
@@ -99,6 +124,8 @@ def stays_apart_exactly(points: np.ndarray, kind: str, time: float, separation: 
         if any(_dot(n, n) * bound_den <= bound_num * m * m for n, m in found):
             return False
         if any(_separates(n, (*begin, *end), bound_num, bound_den) for n in (*(n for n, _ in found), *AXES)):
+            continue
+        if _planes_apart(begin, end, kind, bound_num, bound_den):
             continue
         if k - last.denominator.bit_length() > HALVINGS:
             return None

@@ -2,7 +2,7 @@
 
 Two triangles meet if and only if an edge of one meets the other, so it is enough to test edges against triangles that share no
 vertex with them. Signs of determinants are taken in floating point where its error bound (Shewchuk 1997) leaves no doubt, and
-in integers otherwise: the verdict is that of exact arithmetic on the numbers given.
+in integers otherwise, as where something overflows: the verdict is that of exact arithmetic on the numbers given, up to 1e300 m.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from pdipc.judge import boxes
 
 ORIENT2D_ERROR = (3.0 + 16.0 * 2.0**-53) * 2.0**-53  # Shewchuk's ccwerrboundA
 ORIENT3D_ERROR = (7.0 + 56.0 * 2.0**-53) * 2.0**-53  # Shewchuk's o3derrboundA
-UNDERFLOW = 1e-290  # far above what products lose by underflow
+UNDERFLOW = 1e-290  # far above what a product loses by underflow; times the factor that what was lost is multiplied with
 
 
 def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: np.ndarray | None = None) -> np.ndarray:
@@ -52,6 +52,7 @@ def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: n
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is in doubt
 def edge_triangle_crossings(positions: np.ndarray, edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(k, 2): edge and triangle that share no vertex and have a point in common."""
     ends, corners = positions[edges], positions[triangles]
@@ -92,6 +93,7 @@ def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return edges, owner, np.concatenate([[0], np.cumsum(np.bincount(which, minlength=len(edges)))])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _folded(positions, triangles, edges, owner, first) -> np.ndarray:
     """Pairs of triangles that share an edge and lie in one plane on the same side of it."""
     counts = np.diff(first)
@@ -107,7 +109,9 @@ def _folded(positions, triangles, edges, owner, first) -> np.ndarray:
             arms = [positions[tip] - o for tip in tips]
             normals = [np.cross(d, arm) for arm in arms]
             bounds = [_cross_of_magnitudes(d, arm) for arm in arms]
-            doubt = 16 * 2.0**-53 * np.einsum("ij,ij->i", *bounds) + UNDERFLOW
+            doubt = 16 * 2.0**-53 * np.einsum("ij,ij->i", *bounds) + UNDERFLOW * (
+                1.0 + sum(each.sum(axis=1) for each in bounds)
+            )
             same_side = np.einsum("ij,ij->i", *normals) > -doubt
             flat = _sign(arms[1], normals[0], bounds[0]) == 0
             for row in np.flatnonzero(same_side & flat):
@@ -129,7 +133,8 @@ def _cross_of_magnitudes(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _sign(w: np.ndarray, normal: np.ndarray, normal_sum: np.ndarray) -> np.ndarray:
     """Sign of w . normal with normal = u x v, of differences u, v, w of points."""
     value = np.einsum("ij,ij->i", w, normal)
-    bound = ORIENT3D_ERROR * np.einsum("ij,ij->i", np.abs(w), normal_sum) + UNDERFLOW
+    size = np.abs(w)
+    bound = ORIENT3D_ERROR * np.einsum("ij,ij->i", size, normal_sum) + UNDERFLOW * (1.0 + size.sum(axis=1))
     return np.where(np.abs(value) > bound, np.sign(value), 0.0)
 
 

@@ -264,7 +264,7 @@ def load_deforming(placed: Obstacle, deformation: Deformation, worker: Worker | 
         said = str(error)
         raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
     first = Mesh(frames.points[0].astype(np.float64), mesh.triangles, notes=mesh.notes)
-    return meshes.without_useless(first, where), frames
+    return meshes.without_useless(first, where, frames.points[1:]), frames
 
 
 Read = tuple[Placed, Mesh, np.ndarray, Frames | None]  # a table, its mesh, where its vertices start, and its cache

@@ -189,6 +189,8 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
             found = f"{len(inverted)} of {len(elements)} tets are inverted, first {example}"
             yield Finding(label, found, "every tet needs positive volume: swap two of its vertices")
         flat = np.flatnonzero(np.abs(volumes) <= smallest)
+    elif body.kinematic:
+        flat = np.zeros(0, dtype=np.int64)  # those without area were left out; those of a cache may have one later
     else:
         flat = np.flatnonzero(meshes.flat_triangles(assembly.rest_positions, elements))
     if len(flat):
@@ -272,6 +274,12 @@ def _motions(assembly: Assembly) -> Iterator[Finding]:
     scripts = [(_label(body), slice(body.first, body.last), body.trajectory) for body in assembly.bodies if body.trajectory]
     for label, vertices, trajectory in scripts + [(pin.where, pin.vertices, pin.trajectory) for pin in assembly.pins]:
         start = assembly.positions[vertices]
+        times = trajectory.times
+        with np.errstate(over="ignore", invalid="ignore"):
+            farthest = max(np.abs(trajectory.apply(start, time)).max(initial=0.0) for time in times)
+        if not farthest <= LARGEST:
+            yield Finding(label, f"its motion leads {farthest:.3g} m away", f"it must stay within {LARGEST:g} m")
+            continue
         jump = np.linalg.norm(trajectory.apply(start, 0.0) - start, axis=1).max(initial=0.0)
         if jump > 1e-9 * assembly.scene_size:
             found = f"its motion begins {jump:.4g} m away from where it stands"

@@ -2,8 +2,9 @@
 
 import contextlib
 import importlib.util
+import itertools
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -84,14 +85,16 @@ def flat_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return triangle_areas(vertices, triangles) <= FLAT * longest_edges(vertices, triangles) ** 2
 
 
-def without_useless(mesh: Mesh, where: str) -> Mesh:
+def without_useless(mesh: Mesh, where: str, frames: Iterable[np.ndarray] = ()) -> Mesh:
     """A surface without the triangles that bound nothing: those without area, and repetitions of others; its notes say so.
 
-    Raises SceneError where none is left.
+    frames: (n, 3) places of the vertices at other times; what has an area at any of them stays. Raises SceneError where nothing does.
     """
     notes, triangles = list(mesh.notes), mesh.triangles
     with np.errstate(over="ignore", invalid="ignore"):
         flat = flat_triangles(mesh.vertices, triangles)
+        for frame in itertools.takewhile(lambda _: flat.any(), frames):
+            flat[flat] = flat_triangles(frame.astype(np.float64), triangles[flat])
     if flat.any():
         notes.append(f"{np.count_nonzero(flat)} triangles without an area were left out")
         triangles = triangles[~flat]

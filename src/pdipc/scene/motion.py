@@ -33,6 +33,12 @@ class Trajectory:
     is_rigid = True
 
     @property
+    def times(self) -> list[float]:
+        """s: when it is furthest away, as far as that is known: at its keyframes, or where it ends, or a second after its start."""
+        m = self.motion
+        return [k.time for k in m.keyframes] or [m.start + 1.0 if m.end is None else m.end]
+
+    @property
     def is_static(self) -> bool:
         """Whether nothing ever moves away from the start."""
         m = self.motion
@@ -67,6 +73,11 @@ class Deforming:
     """All vertices of an obstacle over time: on straight lines from frame to frame, then placed as the obstacle is."""
 
     is_rigid = False
+
+    @property
+    def times(self) -> list[float]:
+        """s: when its frames are there; it is nowhere further away in between."""
+        return (self.frames.times + self.begin).tolist()
 
     def __init__(self, frames: Frames, begin: float, matrix: np.ndarray, translation: Sequence[float]):
         """begin: when the first frame is there, s. A vertex of the cache is at matrix (3, 3) vertex + translation (3,), m."""

@@ -623,3 +623,14 @@ class Scene(Table):
         if twice:
             raise ValueError(f"names must be unique; used more than once: {', '.join(twice)}")
         return self
+
+    def save(self, path: str | Path) -> None:
+        """Writes TOML that `load_scene` reads as the same scene; what is the default is left out. Raises OSError where it cannot be
+        written, ValueError for a name that does not end in .toml.
+        """
+        from pdipc.scene.save import to_toml
+
+        path = Path(path)
+        if path.suffix != ".toml":
+            raise ValueError(f'"{path}": a scene is saved as TOML; the name must end in .toml')
+        path.write_text(to_toml(self, path.parent.resolve()), encoding="utf-8")

@@ -4,10 +4,12 @@ What the browser does is only noted by callbacks; one loop, in the caller's thre
 its message, as it does anywhere else, and no state is shared between threads but plain values.
 """
 
+import contextlib
+import io
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,7 @@ import scipy.sparse
 from scipy.sparse.linalg import cg
 
 from pdipc.simulation import Simulation, stats_of
+from pdipc.viewer.guard import EVERYWHERE, Guard
 
 PALETTE = ((228, 120, 60), (70, 120, 190), (110, 170, 90), (200, 90, 120), (150, 120, 190), (220, 180, 70))
 GREY = (185, 185, 190)
@@ -35,18 +38,29 @@ class View:
     """The surfaces of all bodies on a web page, one mesh a body.
 
     triangles: (m, 3); body_of_vertex: (n,); kinds: "solid", "cloth" or "obstacle" a body; positions: (n, 3), m.
-    The page is served at `url` as long as the object lives; if the port is taken, the next free one is used.
-    Raises OSError for a host that this machine cannot serve at.
+    The page is served at `url` as long as the object lives, to whoever knows that address, which has a token in it (`guard`); if the
+    port is taken, the next free one is used. origins: pages elsewhere that may connect too.
+    Raises OSError for a host that this machine cannot serve at, ValueError for an origin that is none.
     """
 
     def __init__(
-        self, triangles: np.ndarray, body_of_vertex: np.ndarray, kinds: list[str], positions: np.ndarray, host: str, port: int
+        self,
+        triangles: np.ndarray,
+        body_of_vertex: np.ndarray,
+        kinds: list[str],
+        positions: np.ndarray,
+        host: str,
+        port: int,
+        origins: Sequence[str] = (),
     ):
         import viser
 
         _must_be_here(host)
-        self.server = viser.ViserServer(host=host, port=port, verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        guard = Guard(host, origins)
+        with guard.on_duty(), contextlib.redirect_stdout(io.StringIO()):  # viser prints its address, without the token
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        shown = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.server.get_port()}/{guard.token}/"
         self.server.scene.set_up_direction("+y")
         self._aim(positions[np.isin(body_of_vertex, [i for i, kind in enumerate(kinds) if kind != "obstacle"])])
         self.meshes, self.vertices = [], []
@@ -90,10 +104,11 @@ def _must_be_here(host: str) -> None:
 class Playback:
     """A run, from `pdipc.open_run`, played in real time, with a slider of its frames. Raises RunError for one without frames."""
 
-    def __init__(self, run: Any, host: str = HOST, port: int = PORT):
+    def __init__(self, run: Any, host: str = HOST, port: int = PORT, origins: Sequence[str] = ()):
         first = run.positions(0)
         self.run, self.times, self.stats = run, np.asarray(run.times), run.stats
-        self.view = View(run.triangles, np.asarray(run.topology["body_of_vertex"]), list(run.body_kinds), first, host, port)
+        of_vertex = np.asarray(run.topology["body_of_vertex"])
+        self.view = View(run.triangles, of_vertex, list(run.body_kinds), first, host, port, origins)
         gui = self.view.server.gui
         last = run.frame_count - 1
         self.frame = gui.add_slider("frame", min=0, max=max(1, last), step=1, initial_value=0, disabled=last == 0)
@@ -178,12 +193,12 @@ class Live:
     device: see `pdipc.build`. Raises SceneError for a scene that cannot be simulated.
     """
 
-    def __init__(self, scene: Any, host: str = HOST, port: int = PORT, device: str | None = None):
+    def __init__(self, scene: Any, host: str = HOST, port: int = PORT, device: str | None = None, origins: Sequence[str] = ()):
         self.simulation = Simulation(scene, device)
         self.assembly = assembly = self.simulation.model.assembly
         kinds = [body.kind for body in assembly.bodies]
         triangles, positions = self.simulation.triangles, self.simulation.positions
-        self.view = View(triangles, assembly.body_of_vertex, kinds, positions, host, port)
+        self.view = View(triangles, assembly.body_of_vertex, kinds, positions, host, port, origins)
         gui = self.view.server.gui
         self.running = gui.add_checkbox("run", initial_value=True)
         self.report = gui.add_markdown(_told(0.0, {}))
@@ -261,14 +276,14 @@ def _told(at: float, record: dict[str, Any]) -> str:
     return "\n\n".join(filter(None, lines))
 
 
-def play(run: Any, host: str = HOST, port: int = PORT) -> None:
+def play(run: Any, host: str = HOST, port: int = PORT, origins: Sequence[str] = ()) -> None:
     """Plays a run, from `pdipc.open_run`, in the browser until Ctrl-C."""
-    _serve(Playback(run, host, port))
+    _serve(Playback(run, host, port, origins))
 
 
-def simulate(scene: Any, host: str = HOST, port: int = PORT, device: str | None = None) -> None:
+def simulate(scene: Any, host: str = HOST, port: int = PORT, device: str | None = None, origins: Sequence[str] = ()) -> None:
     """Simulates a scene live in the browser until Ctrl-C; see `Live`."""
-    _serve(Live(scene, host, port, device))
+    _serve(Live(scene, host, port, device, origins))
 
 
 def _serve(shown: Playback | Live) -> None:

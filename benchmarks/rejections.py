@@ -1,0 +1,164 @@
+"""Hunts for a wrong "cannot meet": `python benchmarks/rejections.py [--pairs N] [--seed S] [--minutes M]`.
+
+Asks whatever in the package leaves pairs out about pairs of every family in tests/collision/hard_queries.py, both kinds, float64 and
+float32, at reaches of any size and at such as a pair just keeps or just misses. What is left out is judged by
+tests/collision/exact.py, which proves it with a margin far above its rounding, or decides it in whole numbers.
+
+- sieve, boxes, ccd, cubic and directions: pair by pair, see tests/collision/rejections.py;
+- patches, bvh: what whole lists leave out of soups of triangles (trees, patches, boxes and the sieve together);
+- near: what counts as near enough to use a list again;
+- judge's boxes, judge's filter: what the witness leaves out (judge/boxes.py), and decides without whole numbers (judge/witness.py).
+
+It must end with "wrong: 0". Writes benchmarks/results/rejections.json.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections import defaultdict
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(REPOSITORY / "tests"), str(REPOSITORY / "benchmarks")]
+
+from ccd import machine  # noqa: E402
+from collision import hard_queries, rejections  # noqa: E402
+
+from pdipc.collision import candidates  # noqa: E402
+from pdipc.device.precision import real  # noqa: E402
+from pdipc.judge import boxes, witness  # noqa: E402
+
+FAMILIES = hard_queries.FAMILIES + hard_queries.CULLING
+BATCH = 3000  # pairs of one family, kind and precision asked about at a time
+SOUPS = 2  # of each family, precision and culling in one round
+MOTIONS = 40  # of each family and precision, for what judges
+
+
+class Count:
+    """asked: pairs. left_out: of those. wrong: of those."""
+
+    def __init__(self):
+        self.asked = self.left_out = self.wrong = 0
+
+    def add(self, asked: int, left_out: int, wrong: int) -> None:
+        self.asked, self.left_out, self.wrong = self.asked + int(asked), self.left_out + int(left_out), self.wrong + int(wrong)
+
+
+def ask_pairs(rng, counts, report) -> None:
+    for family in FAMILIES:
+        for precision in rejections.PRECISIONS:
+            for kind in rejections.KINDS:
+                points, reach = rejections.pairs(family, kind, precision, BATCH, rng)
+                for name, ask in rejections.REJECTIONS.items():
+                    rejected = ask(points, kind, precision, reach)
+                    wrong = rejections.wrong(points, kind, reach, rejected)
+                    counts[name].add(len(points), rejected.sum(), len(wrong))
+                    for i in wrong:
+                        report(name, family, precision, kind, points[i], reach[i])
+
+
+def ask_lists(rng, counts, report) -> None:
+    for family in FAMILIES:
+        for precision in rejections.PRECISIONS:
+            for method in ("patches", "bvh"):
+                for _ in range(SOUPS):
+                    *mesh, reach = rejections.soup(family, precision, rng)
+                    found = rejections.unlisted(*mesh, reach, precision, method)
+                    for kind, (points, asked) in zip(rejections.KINDS, found, strict=True):
+                        reaches = np.full(len(points), reach)
+                        wrong = rejections.wrong(points, kind, reaches, np.ones(len(points), dtype=bool))
+                        counts[method].add(asked, len(points), len(wrong))
+                        for i in wrong:
+                            report(method, family, precision, kind, points[i], reach)
+
+
+def ask_near(rng, counts, report) -> None:
+    """One vertex a launch, since a launch answers for all of them at once: a few are enough."""
+    for precision in rejections.PRECISIONS:
+        number, n = real(precision), 500
+        exponent = rng.uniform(*((-120, 120) if precision == "float64" else (-40, 30)), (n, 1))
+        y = rng.normal(size=(n, 3)) * 10.0**exponent
+        margin = np.abs(y).max(axis=1) * 10.0 ** rng.uniform(-9, 3, n)
+        off = rng.normal(size=(n, 3)) * rng.choice([1.0, 1e-3], (n, 3))
+        off *= (margin / np.linalg.norm(off, axis=1) * (1 + rng.normal(size=n) * 10.0 ** rng.uniform(-17, -5, n)))[:, None]
+        x, y, margin = ((v.astype(precision)).astype(float) for v in (y + off, y, margin))
+        away = wp.zeros(4, dtype=wp.int32, device="cpu")
+        for i in range(n):
+            away.zero_()
+            one, other = (wp.array(v[i : i + 1], dtype=number.vec3, device="cpu") for v in (x, y))
+            depart = candidates.kernels(number).depart
+            wp.launch(depart, 1, [0, one, one, other, other, number.scalar(margin[i]), away], device="cpu")
+            near = away.numpy()[0] == 0
+            far = sum((Fraction(a) - Fraction(b)) ** 2 for a, b in zip(x[i], y[i], strict=True))
+            wrong = near and far > (Fraction(margin[i]) * (1 + Fraction(candidates.ROUNDING) / 10)) ** 2
+            counts["near"].add(1, near, wrong)
+            if wrong:
+                report("near", None, precision, "", np.stack([x[i], y[i]]), margin[i])
+
+
+def ask_judge(rng, counts, report) -> None:
+    """Edges and triangles at the start of a query: what the witness leaves out, or decides, against whole numbers."""
+    for family in FAMILIES:
+        for precision in rejections.PRECISIONS:
+            x, _, triangles, _ = rejections.soup(family, precision, rng, MOTIONS)
+            if len(x) == 0:
+                continue
+            edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+            ends, corners = x[edges], x[triangles]
+            overlapping = boxes.overlapping(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
+            met = np.all(
+                (ends.min(axis=1)[:, None] <= corners.max(axis=1)) & (ends.max(axis=1)[:, None] >= corners.min(axis=1)), axis=2
+            )
+            found = np.zeros_like(met)
+            found[overlapping[:, 0], overlapping[:, 1]] = True
+            counts["judge's boxes"].add(met.size, (~found).sum(), (met & ~found).sum())
+            apart = ~(edges[:, None, :, None] == triangles[None, :, None, :]).any(axis=(2, 3))
+            crossings = np.zeros_like(met)
+            crossings[tuple(witness.edge_triangle_crossings(x, edges, triangles).T)] = True
+            asked = np.argwhere(met & apart)
+            asked = asked[rng.permutation(len(asked))[:300]]
+            right = np.array([witness.segment_meets_triangle(*ends[i], *corners[j]) for i, j in asked], dtype=bool)
+            said = crossings[tuple(asked.T)]
+            counts["judge's filter"].add(len(asked), (~said).sum(), (said != right).sum())
+            for i, j in asked[said != right]:
+                report("judge's filter", family, precision, "", np.concatenate([ends[i], corners[j]]), 0.0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=10_000_000, help="pairs to ask about, all together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=60.0, help="ends after this time, however many were asked")
+    parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "rejections.json")
+    options = parser.parse_args()
+    rng, counts, examples = np.random.default_rng(options.seed), defaultdict(Count), []
+
+    def report(name, family, precision, kind, points, reach) -> None:
+        examples.append([name, getattr(family, "__name__", ""), precision, kind, np.asarray(points).tolist(), float(reach)])
+        print("WRONG", *examples[-1], flush=True)
+
+    begun, rounds = time.perf_counter(), 0
+    while True:
+        for ask in (ask_pairs, ask_lists, ask_near, ask_judge):
+            ask(rng, counts, report)
+        rounds += 1
+        asked = sum(count.asked for name, count in counts.items() if not name.startswith("judge"))
+        seconds = time.perf_counter() - begun
+        print(f"{asked:,} pairs in {seconds:.0f} s, wrong: {sum(count.wrong for count in counts.values())}", flush=True)
+        if asked >= options.pairs or seconds > 60 * options.minutes:
+            break
+    rows = {name: vars(count) for name, count in counts.items()}
+    for name, row in rows.items():
+        print(f"{name:22} {row['asked']:12,} asked {row['left_out']:12,} left out {row['wrong']:6} wrong")
+    result = {"machine": machine(), "seed": options.seed, "seconds": round(seconds), "pairs": asked, "of": rows}
+    options.output.write_text(json.dumps(result | {"examples": examples[:20]}, indent=1) + "\n")
+    return int(any(count.wrong for count in counts.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

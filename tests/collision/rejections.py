@@ -1,0 +1,215 @@
+"""What culling and CCD say "cannot meet" about, pair by pair, so that an exact judge can ask whether it is so.
+
+Each of `REJECTIONS` is f(points (n, 8, 3), kind, precision, reach (n,)) -> (n,) bool: whether the pairs are left out, which promises that
+they stay farther apart than twice `reach`, all the way from the rows 0 to 3 to the rows 4 to 7. Points and reach are numbers of
+that precision.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from collision import exact
+from pdipc.collision import broad_phase, ccd, moving_boxes, sieve, surface
+from pdipc.device.launch import Device
+from pdipc.device.precision import kernel, real
+
+KINDS = ("vertex_triangle", "edge_edge")
+PRECISIONS = ("float64", "float32")
+BACKOFF = 0.2  # of CCD; with a reach of nothing it has no say in what is rejected
+
+
+@functools.cache
+def kernels(precision: str, kind: str):
+    """(sieve, boxes, ccd): kernels that ask about a list of pairs whose vertices are in a row."""
+    number = real(precision)
+    module = number.module(f"{__name__}.{kind}")
+    passes, Sieve = sieve.functions(number), sieve.functions(number).Sieve
+    edges = kind == "edge_edge"
+    time_of = getattr(ccd.functions(number), kind)
+    later_of = getattr(ccd.variant(number, rejects=False), kind)
+    scalar, vec3 = number.scalar, number.vec3
+
+    @kernel(module, f"ask_sieve_{kind}")
+    def ask_sieve(near: Sieve, out: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        k = 4 * i
+        met = bool(True)
+        if wp.static(edges):
+            met = passes.edge_edge(near, wp.vec2i(k, k + 1), wp.vec2i(k + 2, k + 3))
+        else:
+            met = passes.vertex_triangle(near, k, wp.vec3i(k + 1, k + 2, k + 3))
+        out[i] = wp.where(met, 0, 1)
+
+    @kernel(module, f"ask_boxes_{kind}")
+    def ask_boxes(boxes: moving_boxes.Boxes, out: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        k = 4 * i
+        a = moving_boxes.load(boxes, k)
+        b = moving_boxes.join(moving_boxes.load(boxes, k + 2), moving_boxes.load(boxes, k + 3))
+        other = moving_boxes.load(boxes, k + 1)
+        if wp.static(edges):
+            a = moving_boxes.join(a, other)
+        else:
+            b = moving_boxes.join(b, other)
+        out[i] = wp.where(moving_boxes.meet(a, b), 0, 1)
+
+    def ask_ccd(name, of):
+        @kernel(module, f"{name}_{kind}")
+        def ask(
+            begin: wp.array(dtype=vec3),
+            end: wp.array(dtype=vec3),
+            xi: wp.array(dtype=scalar),
+            backoff: scalar,
+            out: wp.array(dtype=wp.int32),
+        ):
+            i = wp.tid()
+            k = 4 * i
+            t = of(
+                begin[k], begin[k + 1], begin[k + 2], begin[k + 3], end[k], end[k + 1], end[k + 2], end[k + 3],
+                xi[i], backoff, scalar(0.0),
+            )  # fmt: skip
+            out[i] = wp.where(t > scalar(1.0), 1, 0)
+
+        return ask
+
+    return ask_sieve, ask_boxes, ask_ccd("ask_ccd", time_of), ask_ccd("ask_later", later_of)
+
+
+def _arrays(points, precision, reach):
+    number = real(precision)
+    begin, end = (
+        wp.array(np.ascontiguousarray(points[:, part]).reshape(-1, 3), dtype=number.vec3, device="cpu")
+        for part in (slice(0, 4), slice(4, 8))
+    )
+    return begin, end, wp.array(np.repeat(reach, 4), dtype=number.scalar, device="cpu")
+
+
+def by_sieve(points, kind, precision, reach):
+    near = sieve.functions(real(precision)).Sieve()
+    near.begin, near.end, near.reach = _arrays(points, precision, reach)
+    return _ask(0, kind, precision, len(points), [near])
+
+
+def by_boxes(points, kind, precision, reach):
+    begin, end, reaches = _arrays(points, precision, reach)
+    boxes = moving_boxes.boxes(len(begin), Device("cpu", 1))
+    Device("cpu", 1).launch(moving_boxes.kernels(real(precision)).vertex_boxes, len(begin), [begin, end, reaches, boxes])
+    return _ask(1, kind, precision, len(points), [boxes])
+
+
+def by_ccd(points, kind, precision, reach, which=2):
+    begin, end, _ = _arrays(points, precision, reach)
+    number = real(precision)
+    with np.errstate(over="ignore"):
+        xi = wp.array((2 * np.asarray(reach, number.numpy)).astype(number.numpy), dtype=number.scalar, device="cpu")
+    return _ask(which, kind, precision, len(points), [begin, end, xi, number.scalar(BACKOFF)])
+
+
+def by_cubic_and_directions(points, kind, precision, reach):
+    """CCD without its first reject."""
+    return by_ccd(points, kind, precision, reach, 3)
+
+
+REJECTIONS = {"sieve": by_sieve, "boxes": by_boxes, "ccd": by_ccd, "cubic and directions": by_cubic_and_directions}
+
+
+def _ask(which, kind, precision, count, inputs):
+    out = wp.zeros(count, dtype=wp.int32, device="cpu")
+    wp.launch(kernels(precision, kind)[which], count, [*inputs, out], device="cpu")
+    return out.numpy().astype(bool)
+
+
+def pairs(family, kind, precision, n, rng):
+    """(points, reach) of a family, in numbers of that precision: reaches of any size, and such as the pairs just keep, or miss.
+
+    Without a pair that is not finite in this precision.
+    """
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        points = family(rng, n).astype(precision).astype(float)
+        points = points[np.isfinite(points).all(axis=(1, 2))]
+        n = len(points)
+        size = np.abs(points - points[:, :1]).max(axis=(1, 2))
+        free = size * 10.0 ** rng.uniform(-18, 0.3, n)
+        least = np.minimum.reduce([exact.estimate(points, kind, t) for t in (0.0, 0.5, 1.0)])
+        off = rng.choice([-1, 1], n) * 10.0 ** rng.uniform(-17, -1, n)
+        least = np.where(rng.random(n) < 0.4, exact.along_axes(points, kind), least)
+        close = least * (1 + off) + rng.choice([0, 0, 1e-16, -1e-16, 3e-16], n) * size
+        reach = 0.5 * np.where(rng.random(n) < 0.4, free, close)
+        reach = np.where(np.isfinite(reach), np.maximum(reach, 0.0), 0.0).astype(precision)
+    return points, reach.astype(float)
+
+
+def wrong(points, kind, reach, rejected):
+    """Indices of the rejected pairs that come as near as twice `reach` on their way, by exact arithmetic."""
+    asked = np.flatnonzero(rejected)
+    if not len(asked):
+        return asked
+    return asked[~exact.stays_apart(points[asked], kind, np.ones(len(asked)), 2 * reach[asked])]
+
+
+# --- whole lists: trees, patches, boxes and the sieve together ---
+
+
+def soup(family, precision, rng, count=10):
+    """(x0, x1, triangles, reach): loose triangles, of which each two hold a query of the family, and one reach, near its gaps."""
+    n = 2 * count
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        points = family(rng, n).astype(precision).astype(float)
+        points = points[np.isfinite(points).all(axis=(1, 2))][:count]
+        n = len(points)
+        # three more vertices: a vertex gets a triangle that it is a corner of, or each edge one
+        weights = rng.dirichlet(np.ones(4), (n, 3))
+        more = np.concatenate([weights @ points[:, :4], weights @ points[:, 4:]], axis=1)
+        more = (more * rng.uniform(0.5, 1.5, more.shape)).astype(precision).astype(float)
+        more = np.where(np.isfinite(more), more, 0.0)
+        x0, x1 = (
+            np.concatenate([points[:, part], more[:, own]], axis=1)
+            for part, own in ((slice(4), slice(3)), (slice(4, 8), slice(3, 6)))
+        )
+        edges = np.array([[0, 1, 4], [2, 3, 5]])
+        face = np.array([[1, 2, 3], [0, 4, 5]])
+        corners = np.where(rng.random((n, 1, 1)) < 0.5, edges, face) + 7 * np.arange(n)[:, None, None]
+        kinds = rng.choice(KINDS)
+        reach = rng.choice(0.5 * exact.estimate(points, kinds, 0.5)) * rng.choice([1.0, 1.5, 1e-3]) if n else 0.0
+        reach = float(np.asarray(reach if np.isfinite(reach) else 0.0).astype(precision))
+    return x0.reshape(-1, 3), x1.reshape(-1, 3), corners.reshape(-1, 3).astype(np.int32), reach
+
+
+def lists(x0, x1, triangles, reach, precision, method):
+    """(surface, vertex-triangle pairs (k, 2), edge-edge pairs) that culling lists, in its own numbering of primitives."""
+    device, number = Device("cpu", 1), real(precision)
+    n = len(x0)
+    skin = surface.build(device, triangles, x0, np.zeros(n, int), np.zeros(n, bool))
+    search = broad_phase.BroadPhase(device, number, skin, method)
+    begin, end = (wp.array(x, dtype=number.vec3, device="cpu") for x in (x0, x1))
+    reaches = wp.array(np.full(n, reach), dtype=number.scalar, device="cpu")
+    near = sieve.functions(number).Sieve()
+    near.begin, near.end, near.reach = begin, end, reaches
+    search.restructure(begin, reaches)
+    while True:
+        search.find(begin, end, reaches, near)
+        if not search.grow():
+            return skin, *(each.pairs.numpy()[: each.count.numpy()[0]] for each in search.lists)
+
+
+def unlisted(x0, x1, triangles, reach, precision, method):
+    """Of each kind: queries (k, 8, 3) of the pairs that culling does not list, and how many pairs there are."""
+    skin, *listed = lists(x0, x1, triangles, reach, precision, method)
+    vertices, edges, faces = skin.members
+    first = [np.repeat(np.arange(len(vertices)), len(faces)), np.triu_indices(len(edges), 1)[0]]
+    second = [np.tile(np.arange(len(faces)), len(vertices)), np.triu_indices(len(edges), 1)[1]]
+    number = np.zeros(len(x0), dtype=int)
+    number[vertices.ravel()] = np.arange(len(vertices))
+    found = []
+    for kind, i, j, pairs, (one, other) in zip(KINDS, first, second, listed, ((vertices, faces), (edges, edges)), strict=True):
+        pairs = np.column_stack([number[pairs[:, 0]], pairs[:, 1]]) if kind == "vertex_triangle" else pairs
+        left = np.ones((len(one), len(other)), dtype=bool)
+        left[pairs[:, 0], pairs[:, 1]] = False
+        quads = np.concatenate([one[i], other[j]], axis=1)
+        split = one.shape[1]
+        apart = ~(quads[:, :split, None] == quads[:, None, split:]).any(axis=(1, 2))
+        out = quads[apart & left[i, j]]
+        found.append((np.concatenate([x0[out], x1[out]], axis=1), int(apart.sum())))
+    return found

@@ -1,0 +1,114 @@
+"""Whatever says "cannot meet" is right about it: judged in exact arithmetic, on pairs at the edge of what may be left out.
+
+`benchmarks/rejections.py` asks about ten million more.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import warp as wp
+
+from collision import hard_queries, rejections
+from pdipc.collision import candidates, sieve
+from pdipc.device.precision import real
+
+FAMILIES = hard_queries.FAMILIES + hard_queries.CULLING
+
+
+def left_out(ask, families, kind, precision, n):
+    """(pairs left out, those that are wrong) by family name."""
+    found = {}
+    for k, family in enumerate(families):
+        points, reach = rejections.pairs(family, kind, precision, n, np.random.default_rng(k))
+        rejected = ask(points, kind, precision, reach)
+        found[family.__name__] = (int(rejected.sum()), len(rejections.wrong(points, kind, reach, rejected)))
+    return found
+
+
+@pytest.mark.parametrize("precision", rejections.PRECISIONS)
+@pytest.mark.parametrize("kind", rejections.KINDS)
+@pytest.mark.parametrize("name", rejections.REJECTIONS)
+def test_what_is_left_out_stays_apart(name, kind, precision):
+    found = left_out(rejections.REJECTIONS[name], FAMILIES, kind, precision, 60)
+    assert {family: bad for family, (_, bad) in found.items() if bad} == {}
+    assert sum(count for count, _ in found.values()) > 100  # of 1260
+
+
+@pytest.mark.parametrize("kind", rejections.KINDS)
+def test_the_sieve_needs_its_slack(kind, monkeypatch):
+    """Without the bound of its rounding it leaves out pairs that are too near."""
+    close = (hard_queries.at_rest, hard_queries.needles, hard_queries.stacked_sheets, hard_queries.touching)
+    assert sum(bad for _, bad in left_out(rejections.by_sieve, close, kind, "float64", 4000).values()) == 0
+    monkeypatch.setattr(sieve, "SLACK", 0.0)
+    with fresh():
+        assert sum(bad for _, bad in left_out(rejections.by_sieve, close, kind, "float64", 4000).values()) > 0
+
+
+class fresh:
+    """Kernels with the constants of now, and after it those of before."""
+
+    def __enter__(self):
+        self.clear()
+
+    def __exit__(self, *_):
+        self.clear()
+
+    def clear(self):
+        for made in (sieve.functions, rejections.kernels):
+            made.cache_clear()
+
+
+@pytest.mark.parametrize("method", ("patches", "bvh"))
+@pytest.mark.parametrize("precision", rejections.PRECISIONS)
+def test_whole_lists(method, precision):
+    """Trees, patches, boxes and sieve together."""
+    count = 0
+    for k, family in enumerate(FAMILIES):
+        *mesh, reach = rejections.soup(family, precision, np.random.default_rng(k), 5)
+        for kind, (points, _) in zip(rejections.KINDS, rejections.unlisted(*mesh, reach, precision, method), strict=True):
+            everyone = np.ones(len(points), dtype=bool)
+            assert not len(rejections.wrong(points, kind, np.full(len(points), reach), everyone)), family.__name__
+            count += len(points)
+    assert count > 3000
+
+
+@pytest.mark.parametrize("precision", rejections.PRECISIONS)
+def test_far_beyond_what_boxes_can_tell_apart(precision):
+    """At 1e19 m and at the largest numbers there are: whatever touches is listed, and nothing breaks."""
+    most = float(np.finfo(precision).max)
+    for scale in (1e19, 0.4 * most):
+        x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -1], [0.2, 0.2, 1], [0.7, 0.9, 1]]) * scale
+        for method in ("patches", "bvh"):
+            _, vertex_triangle, edge_edge = rejections.lists(x, -x, np.array([[0, 1, 2], [3, 4, 5]]), 0.0, precision, method)
+            assert len(vertex_triangle) + len(edge_edge) > 0
+            (points, _), (others, _) = rejections.unlisted(x, -x, np.array([[0, 1, 2], [3, 4, 5]]), 0.0, precision, method)
+            for kind, left in zip(rejections.KINDS, (points, others), strict=True):
+                assert not len(rejections.wrong(left, kind, np.zeros(len(left)), np.ones(len(left), dtype=bool)))
+
+
+@pytest.mark.parametrize("precision", rejections.PRECISIONS)
+def test_what_counts_as_near_is_near(precision):
+    """A list that is used again was made for vertices within the margin, but for the rounding that its reach has room for."""
+    rng = np.random.default_rng(0)
+    number = real(precision)
+    n = 4000
+    low, high = (-120, 120) if precision == "float64" else (-40, 30)
+    y = rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(low, high, (n, 1))
+    margin = np.abs(y).max(axis=1) * 10.0 ** rng.uniform(-9, 3, n)
+    off = rng.normal(size=(n, 3)) * rng.choice([1.0, 1e-3], (n, 3))
+    off *= (margin / np.linalg.norm(off, axis=1) * (1 + rng.normal(size=n) * 10.0 ** rng.uniform(-17, -5, n)))[:, None]
+    x, y, margin = ((v.astype(precision)).astype(float) for v in (y + off, y, margin))
+    kernels = candidates.kernels(number)
+    near = np.zeros(n, dtype=bool)
+    away = wp.zeros(4, dtype=wp.int32, device="cpu")
+    for i in range(n):
+        away.zero_()
+        one, other = (wp.array(v[i : i + 1], dtype=number.vec3, device="cpu") for v in (x, y))
+        wp.launch(kernels.depart, 1, [0, one, one, other, other, number.scalar(margin[i]), away], device="cpu")
+        near[i] = away.numpy()[0] == 0
+    right = np.array([sum((Fraction(a) - Fraction(b)) ** 2 for a, b in zip(p, q)) for p, q in zip(x, y)])  # noqa: B905
+    room = np.array([(Fraction(m) * (1 + Fraction(candidates.ROUNDING) / 10)) ** 2 for m in margin])
+    assert 0.2 * n < near.sum() < 0.9 * n
+    assert (right <= room)[near].all()
+    assert not near[margin <= candidates.LEAST_MARGIN].any()
