@@ -93,13 +93,14 @@ class BlockMatrix:
         self._starts = wp.array(starts.astype(np.int32), device=device.warp)
         self._slots = upload(slot[order], wp.int32)
         self._scalars = upload(scalars, real.scalar)
+        self._blocks = projector.blocks  # made now: recording must not allocate
         self._kernels = kernels(real)
 
     def assemble(self, base: wp.array, u: wp.array, project: wp.array) -> None:
         """Launches the values at x = base + u; project: see `Hessians`."""
         k, device = self._kernels, self.device
         self.projector.differentiate(base, u, project)
-        inputs = [self._starts, self._slots, self._scalars, self.projector.blocks, self.values]
+        inputs = [self._starts, self._slots, self._scalars, self._blocks, self.values]
         device.launch(k.gather, self.nnz, inputs, grain=16)
         device.launch(k.gather_diagonal, self.count, [self.offsets, self.held, self.values, self.diagonal], grain=32)
 
