@@ -206,7 +206,9 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
             differs = said or judge(run, expected[number])
             if differs:
                 wrong += 1
-                print(f"{kind}, run {i} of seed {seed}: {differs}\n{log.read_text()[-2000:] if log.exists() else ''}", flush=True)
+                print(
+                    f"{kind}, run {i} of seed {seed}: {differs}\n{log.read_text()[-2000:] if log.exists() else ''}", flush=True
+                )
             shutil.rmtree(run, ignore_errors=True)
             log.unlink(missing_ok=True)
         failures += wrong

@@ -4,26 +4,40 @@ import numpy as np
 import pytest
 import warp as wp
 
-from pdipc.barrier import pairs, restitution
-from pdipc.collision import bvh, candidates, patches, queries, truncation
+from pdipc.barrier import exact, friction, pairs, restitution
+from pdipc.collision import bvh, candidates, islands, patches, queries, truncation
 from pdipc.collision import moving_boxes as sweep
 from pdipc.constraints import projector
 from pdipc.device import launch as parallel
 from pdipc.device.precision import real
-from pdipc.drive import kernels as step_kernels
+from pdipc.integration import inertia
 from pdipc.integration import loads as forces
-from pdipc.nonlinear import anderson
-from pdipc.paper_mode import energy_rate
+from pdipc.linear import block_pcg, blocks, rigid_modes
+from pdipc.nonlinear import anderson, local_global, newton, sums
+from pdipc.paper_mode import energy_rate, printed
 from pdipc.paper_mode import targets as paper
 
 FACTORIES = {
-    "step": step_kernels,
+    "step": inertia.kernels,
+    "newton": newton.kernels,
+    "body sums": lambda _: sums.kernels(),
+    "local-global": local_global.kernels,
+    "printed": printed.kernels,
+    "exact barrier": exact.kernels,
+    "barrier coupling": lambda precision: {"couple": exact.coupling(precision)},
+    "friction": friction.kernels,
+    "friction coupling": lambda precision: {"couple": friction.coupling(precision)},
+    "islands": islands.kernels,
+    "blocks": blocks.kernels,
+    "rigid modes": rigid_modes.kernels,
+    "block pcg": block_pcg.kernels,
+    "flags": lambda precision: {"positive": newton._positive(precision)},
     "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),
     "scan": lambda _: parallel.scan_kernels(),
     "anderson": anderson.kernels,
     "energy_rate": energy_rate.kernels,
-    "gather": projector.kernels,
+    "gather": projector.kernels_of,
     **{kind.__name__.rsplit(".", 1)[1]: kind.kernels for kind in projector.KINDS},
     "candidates": candidates.kernels,
     "sweep": sweep.kernels,

@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from pdipc.device.launch import one_at_a_time
-from pdipc.drive import Work
 from pdipc.model import Model, State, build
 from pdipc.output.results import Run
 from pdipc.scene.schema import Scene
+from pdipc.work import Work
 
 
 @dataclass
@@ -39,7 +39,7 @@ def audit(model: Model, state: State, work: Work) -> Audit:
     """The energies and momenta of `state`."""
     work.list_pairs(state.positions)
     numbers = wp.zeros(2, dtype=model.real.scalar, device=model.device.warp)
-    model.projector.energy(state.positions, numbers, 0)
+    model.projector.energy(state.positions, state.remainders, numbers, 0)
     work.pairs.energy(numbers, 1)
     elastic, barrier = (float(value) for value in numbers.numpy())
     mass = model.external.mass[:, None]
@@ -63,9 +63,7 @@ def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
     Without friction, which depends on a step and not on a state alone.
     """
     work.list_pairs(state.positions)
-    force = wp.zeros(model.vertex_count, dtype=model.real.vec3, device=model.device.warp)
-    work.pairs.linearize(state.positions, state.positions, state.positions, force)
-    return force.numpy().astype(np.float64)
+    return work.pairs.forces(state.positions).numpy().astype(np.float64)
 
 
 def body_forces(model: Model, state: State, work: Work) -> dict[str, np.ndarray]:

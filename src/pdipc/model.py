@@ -11,9 +11,11 @@ import warp as wp
 from pdipc import constraints
 from pdipc.collision import broad_phase, surface
 from pdipc.constraints import (
+    corotated,
     curved_bending,
     edge_length,
     material,
+    neo_hookean,
     point_attachment,
     quadratic_bending,
     tet_strain,
@@ -37,19 +39,26 @@ DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures bette
 
 # The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
 DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": {"barrier": "pcg", "paper": "a-jacobi"}}
-INNER_TOLERANCE = 0.2
+
+
+TOLERANCE_SPEED, TOLERANCE_PART = 0.01, 1e-3  # the default: m/s, and the part of the smallest body's size
+LOCAL_GLOBAL_ONLY = {
+    "inner_iterations", "linear_solver", "linear_iterations", "linear_tolerance", "solver_order", "solver_drop"
+}  # fmt: skip
 
 
 @dataclass
 class State:
     """Positions, velocities and accelerations of all n vertices at one time.
 
-    positions: (n,) vec3, m. velocities: (n,) vec3, m/s. accelerations: (n,) vec3, m/s^2. time: s. step: steps done.
+    positions: (n,) vec3, m. velocities: (n,) vec3, m/s. accelerations: (n,) vec3, m/s^2. remainders: (n,) vec3, m, what rounding
+    took off the positions when they were stored: motions smaller than that add up. time: s. step: steps done.
     """
 
     positions: wp.array
     velocities: wp.array
     accelerations: wp.array
+    remainders: wp.array
     time: float = 0.0
     step: int = 0
 
@@ -61,6 +70,7 @@ class State:
             positions=wp.clone(self.positions),
             velocities=wp.clone(self.velocities),
             accelerations=wp.clone(self.accelerations),
+            remainders=wp.clone(self.remainders),
         )
 
     def __deepcopy__(self, memo: dict) -> "State":
@@ -73,6 +83,7 @@ class State:
             "positions": self.positions.numpy().copy(),
             "velocities": self.velocities.numpy().copy(),
             "accelerations": self.accelerations.numpy().copy(),
+            "remainders": self.remainders.numpy().copy(),
             "time": np.float64(self.time),
             "step": np.int64(self.step),
         }
@@ -83,10 +94,10 @@ class Settings:
     """How a step is solved: the scene's `simulation` and `contact` tables in metres and seconds."""
 
     time_step: float  # of one sub-step
-    outer_tolerance: float  # m: a step has converged when an outer iteration's untruncated motion is smaller
+    nonlinear_solver: str  # "newton", "local-global" or "printed", the paper's
+    tolerance: float  # m: a step has converged when an outer iteration's untruncated motion is smaller
     max_outer: int
     inner_iterations: int
-    inner_tolerance: float  # the inner loop ends once an iteration moves by less than this part of the first
     activation_distance: float
     slip_threshold: float  # m
     per_vertex_truncation: bool
@@ -105,7 +116,8 @@ class Model:
     half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness;
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
-    rigid: vertex ranges of the obstacles that move without deforming. triangles: (m, 3) int32, all surfaces.
+    solver: of the local-global method, else None. free_vertices: (n,) bool; held: (n,) kg/s^2, what a common motion of all costs each:
+    mass over h^2, damping, attachments to points. rigid: vertex ranges of the obstacles that move without deforming. triangles: (m, 3) int32, all surfaces.
     """
 
     scene: Scene
@@ -122,12 +134,29 @@ class Model:
     body_mass: wp.array
     rigidity: wp.array
     projector: constraints.Projector
-    solver: Solver
+    solver: Solver | None
+    free_vertices: np.ndarray
+    held: np.ndarray
     surface: surface.Surface
     broad_phase: broad_phase.BroadPhase
     external: ExternalForces
     rigid: list[tuple[int, int]]
     triangles: np.ndarray
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether any pair of bodies rubs."""
+        return bool((self.friction.numpy() > 0.0).any())
+
+    @property
+    def scripted_vertices(self) -> bool:
+        """Whether anything follows a script, an obstacle or a pin, at rest or moving."""
+        return self.moves
+
+    @property
+    def recordable(self) -> bool:
+        """Whether a step can be one graph."""
+        return self.solver is None or self.solver.recordable
 
     @property
     def vertex_count(self) -> int:
@@ -148,14 +177,15 @@ class Model:
         def upload(name: str) -> wp.array:
             return wp.array(np.asarray(arrays[name]), dtype=self.real.vec3, device=self.device.warp)
 
-        vectors = [upload(name) for name in ("positions", "velocities", "accelerations")]
+        arrays = {"remainders": np.zeros_like(arrays["positions"]), **arrays}  # files of earlier versions have none
+        vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
         return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
 
     def move_anchors(self, time: float) -> None:
         """Uploads where the points of soft pins are at `time`."""
         soft = [pin for pin in self.assembly.pins if pin.stiffness is not None and len(pin.vertices)]
-        for pin, anchor in zip(soft, self.projector.anchors, strict=True):
-            anchor.assign(self.assembly.pin_targets(pin, time))
+        if self.projector.anchors is not None:
+            self.projector.anchors.assign(np.concatenate([self.assembly.pin_targets(pin, time) for pin in soft]))
 
     @functools.cached_property
     def moves(self) -> bool:
@@ -186,19 +216,27 @@ def build(scene: Scene, device: str | None = None) -> Model:
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)
     free[assembly.kinematic_vertices] = False
-    sets, mass = elasticity(assembly)
+    nonlinear = _nonlinear_solver(scene)
+    sets, mass = elasticity(assembly, nonlinear == "newton")
     mass = np.where(free, mass, 0.0)
-    stiffness = constraints.stiffness_matrix(n, sets)
-    matrix = stiffness + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
+    held = mass * (1.0 / (h * h) + sim.damping / h)
+    for s in sets:
+        if s.kind == "point_attachment":
+            np.add.at(held, s.vertices[:, 0], s.weight)
     method, truncation = scene.contact.method, scene.contact.truncation
     if truncation == "auto":
         truncation = "global" if method == "paper" else "per_vertex"
-    name = DEFAULT_SOLVER["cuda" if place.is_cuda else "cpu"][method] if sim.linear_solver == "auto" else sim.linear_solver
-    options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
-    if name == "a-jacobi":
-        options["drop"] = sim.solver_drop
-    system = System(place, number, matrix, free)
-    solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
+    solver = None
+    if nonlinear != "newton":
+        matrix = constraints.stiffness_matrix(n, sets) + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
+        name = sim.linear_solver
+        if name == "auto":
+            name = DEFAULT_SOLVER["cuda" if place.is_cuda else "cpu"][method]
+        options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
+        if name == "a-jacobi":
+            options["drop"] = sim.solver_drop
+        system = System(place, number, matrix, free)
+        solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
 
     per_vertex = {
         "friction": np.zeros(n),
@@ -227,10 +265,10 @@ def build(scene: Scene, device: str | None = None) -> Model:
         assembly=assembly,
         settings=Settings(
             time_step=h,
-            outer_tolerance=sim.outer_tolerance * assembly.scene_size,
+            nonlinear_solver=nonlinear,
+            tolerance=_tolerance(sim, assembly),
             max_outer=sim.max_outer,
             inner_iterations=sim.inner_iterations,
-            inner_tolerance=INNER_TOLERANCE,
             activation_distance=assembly.activation_distance,
             slip_threshold=scene.contact.friction_velocity * h,
             per_vertex_truncation=truncation == "per_vertex",
@@ -252,6 +290,8 @@ def build(scene: Scene, device: str | None = None) -> Model:
         rigidity=upload(per_vertex["rigidity"]),
         projector=constraints.Projector(place, number, n, sets),
         solver=solver,
+        free_vertices=free,
+        held=held,
         surface=skin,
         broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
@@ -262,6 +302,27 @@ def build(scene: Scene, device: str | None = None) -> Model:
     )
 
 
+def _nonlinear_solver(scene: Scene) -> str:
+    """The method of a step: what the scene says, else what fits its settings."""
+    sim = scene.simulation
+    if scene.contact.method == "paper":
+        return "printed"
+    if sim.nonlinear_solver != "auto":
+        return sim.nonlinear_solver
+    return "local-global" if sim.model_fields_set & LOCAL_GLOBAL_ONLY else "newton"
+
+
+def _tolerance(sim, assembly: Assembly) -> float:
+    """m, of one sub-step."""
+    h = sim.time_step / sim.substeps
+    if sim.tolerance is not None:
+        return sim.tolerance * h
+    smallest, largest = assembly.body_sizes
+    if sim.outer_tolerance is not None:
+        return sim.outer_tolerance * largest
+    return min(TOLERANCE_SPEED * h, TOLERANCE_PART * smallest)
+
+
 def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
     """m/s, along the body."""
     if isinstance(of, SolidMaterial):
@@ -270,17 +331,24 @@ def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
     return float(np.sqrt(of.membrane_stiffness / of.areal_density))
 
 
-def elasticity(assembly: Assembly) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The projective constraints of all bodies (Section 3) and the lumped masses (n,) kg."""
+def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+    """The constraints of all bodies (Section 3) and the lumped masses (n,) kg. newton: for that solver, see `SolidMaterial.model`."""
     x, n = assembly.rest_positions, len(assembly.positions)
     sets, mass = [], np.zeros(n)
     for body in assembly.bodies:
         m = body.material
         if isinstance(m, SolidMaterial):
             strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
-            sets.append(tet_strain.rest(x, body.tets, strain))
-            if volume > 0.0:
-                sets.append(tet_volume.rest(x, body.tets, volume))
+            model = m.model
+            if model == "auto":
+                model = "neo_hookean" if newton else "arap"
+            if model == "arap":
+                sets.append(tet_strain.rest(x, body.tets, strain))
+                if volume > 0.0:
+                    sets.append(tet_volume.rest(x, body.tets, volume))
+            else:
+                kind = corotated if model == "corotated" else neo_hookean
+                sets.append(kind.rest(x, body.tets, 0.5 * strain, volume / 3.0))
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
         elif isinstance(m, ClothMaterial):
             if m.membrane == "springs":

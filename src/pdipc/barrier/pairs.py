@@ -464,6 +464,12 @@ class ActivePairs:
         self.device.launch_list(k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, *here])
         self.gather(rhs)
 
+    def forces(self, x: wp.array) -> wp.array:
+        """(n,) vec3, N: what the frozen pairs exert at x on each vertex."""
+        force = wp.zeros(len(self.ends), dtype=self.real.vec3, device=self.device.warp)
+        self.linearize(x, x, x, force)
+        return force
+
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
         inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]

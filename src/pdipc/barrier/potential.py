@@ -62,6 +62,24 @@ def functions(real: Real) -> SimpleNamespace:
         return c * (scalar(2.0) - c)
 
     @wp.func
+    def wide_barrier(d: wp.float64, d_hat: wp.float64) -> wp.float64:
+        """`barrier` in double precision, whatever the scene's."""
+        if d >= d_hat:
+            return wp.float64(0.0)
+        return -(d - d_hat) * (d - d_hat) * wp.log(d / d_hat)
+
+    @wp.func
+    def parallel_gradient(e1: vec3, e2: vec3):
+        """c = sin^2 / 1e-3 of two edges, as in `mollifier`, and its gradients by both edge vectors."""
+        a = wp.length_sq(e1)
+        b = wp.length_sq(e2)
+        w = wp.cross(e1, e2)
+        scale = scalar(1.0) / (a * b * scalar(PARALLEL))
+        c = wp.length_sq(w) * scale
+        two = scalar(2.0)
+        return c, two * (scale * wp.cross(e2, w) - (c / a) * e1), two * (scale * wp.cross(w, e1) - (c / b) * e2)
+
+    @wp.func
     def smoothed_coulomb(slip: scalar, slip_threshold: scalar) -> scalar:
         """f1(|u|) / |u| of IPC's smoothed Coulomb friction: f1 rises from 0 to 1 over |u| < eps_v h. In 1/m."""
         if slip >= slip_threshold:

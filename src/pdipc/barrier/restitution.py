@@ -11,7 +11,7 @@ The correction dv is the least one in the metric of the implicit step, which spr
 
     min  |h dv|^2_M / (2 h^2) + Psi(x + h dv) - grad Psi(x) . h dv  +  sum_k w/2 (h n . sum_i a_i dv_i - ...)^2
 
-with weights w that are large against the bodies' masses. Local-global iterations solve it. Pairs push as a whole, so momentum is
+with weights w that are large against the bodies' masses. Local-global iterations solve it, or one step of Newton's method. Pairs push as a whole, so momentum is
 conserved. Should the kinetic energy afterwards exceed what the step had to give, dv is shortened.
 
 A body that sound does not cross within a step is not stopped at once, but springs back by itself. There the law would only make its
@@ -36,6 +36,7 @@ WEIGHT = 100.0  # of a pair's constraint, in units of the lighter body's mass / 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    mat43 = wp.types.matrix((4, 3), scalar)
     module = real.module(__name__)
 
     @wp.kernel(module=module)
@@ -136,6 +137,49 @@ def kernels(real: Real) -> SimpleNamespace:
                 force_out[k] = pull[k] * (target[k] - wp.dot(normals[k], moved)) * normals[k]
 
     @wp.kernel(module=module)
+    def linearize_exact(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        x_now: wp.array(dtype=vec3),
+        target: wp.array(dtype=scalar),
+        pull: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=wp.float64),
+        slope_out: wp.array(dtype=mat43),
+        lever_out: wp.array(dtype=mat43),
+        hessian_out: wp.array(dtype=scalar),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                moved = vec3()
+                for s in range(4):
+                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
+                slope = pull[k] * (wp.dot(normals[k], moved) - target[k])
+                lever = mat43()
+                for s in range(4):
+                    for axis in range(3):
+                        lever[s, axis] = weights[k][s] * normals[k][axis]
+                energy_out[k] = wp.float64(0.0)
+                slope_out[k] = slope * lever
+                lever_out[k] = lever
+                hessian_out[k] = pull[k]
+
+    @wp.kernel(module=module)
+    def move(
+        first: int,
+        x: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        p: wp.array(dtype=vec3),
+        x_now_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        x_now_out[i] = x[i] + free[i] * p[i]
+
+    @wp.kernel(module=module)
     def kinetic(
         first: int,
         x_start: wp.array(dtype=vec3),
@@ -178,7 +222,15 @@ def kernels(real: Real) -> SimpleNamespace:
         x_now[i] = x[i] + part[0] * (x_now[i] - x[i])
 
     return SimpleNamespace(
-        clear=clear, aim=aim, inertia=inertia, linearize=linearize, kinetic=kinetic, limit=limit, shorten=shorten
+        clear=clear,
+        aim=aim,
+        inertia=inertia,
+        linearize=linearize,
+        linearize_exact=linearize_exact,
+        move=move,
+        kinetic=kinetic,
+        limit=limit,
+        shorten=shorten,
     )
 
 
@@ -187,7 +239,7 @@ class Restitution:
 
     body_mass: (n,) kg, the mass of each vertex's body, 0 where kinematic. rigidity: (n,) r of each vertex's body, 1 where
     kinematic. restitution: eps in [0, 1]. h: s.
-    needed: (1,) int32 on the device, whether `aim` found a pair to correct. x_now: (n,) m, x + h dv.
+    needed: (1,) int32 on the device, whether `aim` found a pair to correct. u_now: (n,) m, u + h dv, a displacement since the start of the step.
     """
 
     def __init__(
@@ -206,16 +258,16 @@ class Restitution:
         self.device, self.pairs, self.kernels = device, pairs, kernels(real)
         self.mass, self.free, self.body_mass, self.rigidity = mass, free, body_mass, rigidity
         self.restitution, self.h = real.scalar(restitution), real.scalar(h)
-        self.x_now, self.elastic, self.zero = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(3))
+        self.u_now, self.elastic, self.zero = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(3))
         self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.energies = [wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(3)]
         self.sums, self.part = (wp.zeros(size, dtype=real.scalar, device=device.warp) for size in (5, 1))
         self.reducer = Reducer(device, real, n)
 
     def aim(self, x_start: wp.array, x: wp.array, v_start: wp.array) -> None:
-        """Launches the targets of the active pairs; x_now starts at x."""
+        """Launches the targets of the active pairs; u_now starts at x. Here and below x_start and x may be displacements as well."""
         k, device, p = self.kernels, self.device, self.pairs
-        device.copy(self.x_now, x)
+        device.copy(self.u_now, x)
         device.launch_serial(k.clear, [self.needed])
         pairs = [p.count, p.quads, p.weights, p.normals]
         motion = [x_start, x, v_start, self.free, self.body_mass, self.rigidity, self.restitution, self.h]
@@ -224,23 +276,32 @@ class Restitution:
 
     def inertia(self, x: wp.array, force_out: wp.array, increment_out: wp.array) -> None:
         """Launches the force of M and of the elastic forces at x; and a zero start for the increment."""
-        inputs = [self.x_now, x, self.mass, self.free, self.elastic, self.h, force_out, increment_out]
+        inputs = [self.u_now, x, self.mass, self.free, self.elastic, self.h, force_out, increment_out]
         self.device.launch(self.kernels.inertia, len(x), inputs)
 
     def linearize(self, x_start: wp.array, rhs: wp.array) -> None:
         """Adds the pairs' forces to rhs, and makes their Hessian and block diagonal."""
         p = self.pairs
         pairs = [p.count, p.quads, p.weights, p.normals]
-        inputs = [*pairs, x_start, self.x_now, p.gaps, p.stiffness, p.friction, p.hessian, p.force]
+        inputs = [*pairs, x_start, self.u_now, p.gaps, p.stiffness, p.friction, p.hessian, p.force]
         self.device.launch_list(self.kernels.linearize, p.capacity, inputs)
         p.gather(rhs)
+
+    def linearize_exact(self, x_start: wp.array) -> None:
+        """The pairs' forces and Hessian in the form of `BarrierTerm`, in place of the barrier's."""
+        p, k = self.pairs, self.kernels
+        pairs = [p.count, p.quads, p.weights, p.normals]
+        result = [p.energy_of_pair, p.slope, p.lever, p.hessian]
+        self.device.launch_list(k.linearize_exact, p.capacity, [*pairs, x_start, self.u_now, p.gaps, p.stiffness, *result])
+        inputs = [p.ends, p.entries, p.quads, p.free, *result]
+        self.device.launch(p.exact.gather, len(p.ends), [*inputs, p.force_of_vertex, p.diagonal, p.energy_of_vertex])
 
     def limit(self, x_start: wp.array, x: wp.array, v_start: wp.array, acceleration: wp.array) -> None:
         """Shortens the correction so that energy does not rise; elastic energies are in `sums` already."""
         k, device, n = self.kernels, self.device, len(x)
-        inputs = [x_start, x, self.x_now, v_start, acceleration, self.mass, self.h]
+        inputs = [x_start, x, self.u_now, v_start, acceleration, self.mass, self.h]
         device.launch(k.kinetic, n, [*inputs, *self.energies])
         for values, place in zip(self.energies, (SQUARE, CROSS, EXCESS), strict=True):
             self.reducer.sum(values, self.sums, place)
         device.launch_serial(k.limit, [self.sums, self.part])
-        device.launch(k.shorten, n, [x, self.part, self.x_now])
+        device.launch(k.shorten, n, [x, self.part, self.u_now])

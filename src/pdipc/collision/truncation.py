@@ -22,7 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from pdipc.collision import ccd
+from pdipc.collision import ccd, distance
 from pdipc.collision.candidates import Candidates
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real, kernel
@@ -31,14 +31,18 @@ UNIT = 1 << 30  # times are kept as integers over this unit, rounded down: the l
 FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
 LATER_BACKOFF = 0.1  # in the passes that check shortened motions
 SHRINK = 0.9
-MAX_PASSES = 30
+STUBBORN = 20  # passes after which vertices that still hit something stay where they are
+DEEP = 0.5  # of d_hat: a pair that is hit at a smaller gap was squeezed before
+GRADE = 0.1  # strain that an edge may take from a truncation, where neighbours are known
+RINGS = 12  # of neighbours, over which a short motion is felt
+MAX_PASSES = 60  # and after which all do
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
     module = real.module(__name__)
-    c = ccd.functions(real)
+    c, dist = ccd.functions(real), distance.functions(real)
     unit = wp.constant(UNIT)
 
     def sweep(kind: str):
@@ -54,8 +58,10 @@ def kernels(real: Real) -> SimpleNamespace:
             passes: wp.array(dtype=wp.int32),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
+            island_of: wp.array(dtype=wp.int32),
             time_out: wp.array(dtype=wp.int32),
             hits_out: wp.array(dtype=wp.int32),
+            deep_out: wp.array(dtype=wp.int32),
         ):
             worker = span.first + wp.tid()
             backoff = scalar(FIRST_BACKOFF)
@@ -83,6 +89,18 @@ def kernels(real: Real) -> SimpleNamespace:
                         if t <= scalar(1.0):
                             time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
                             hits += 1
+                            if passes[0] == 0:
+                                apart = scalar(0.0)
+                                if wp.static(edge_edge):
+                                    apart = dist.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                else:
+                                    apart = dist.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                if apart - xi < scalar(DEEP) * limits[k][1]:
+                                    # whoever writes, writes the same
+                                    if island_of[q[0]] >= 0:
+                                        deep_out[island_of[q[0]]] = 1
+                                    if island_of[q[3]] >= 0:
+                                        deep_out[island_of[q[3]]] = 1
                     time_out[k] = time
                 hits_out[begin // span.block] = hits
 
@@ -94,6 +112,10 @@ def kernels(real: Real) -> SimpleNamespace:
         multiplier_out[i] = unit
         if i == 0:
             any_hit_out[0] = 0
+
+    @wp.kernel(module=module)
+    def clear(first: int, values_out: wp.array(dtype=wp.int32)):
+        values_out[first + wp.tid()] = 0
 
     @wp.kernel(module=module)
     def spread(
@@ -129,22 +151,61 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         multiplier: wp.array(dtype=wp.int32),
         passes: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vec3),
-        x_tilde: wp.array(dtype=vec3),
         fraction: wp.array(dtype=scalar),
-        x_end_out: wp.array(dtype=vec3),
+        first_fraction: wp.array(dtype=scalar),
     ):
         i = first + wp.tid()
         if multiplier[i] < unit:
             shrink = scalar(1.0)
             if passes[0] > 0:
                 shrink = scalar(SHRINK)
-            fraction[i] = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
-            x_end_out[i] = x[i] + fraction[i] * (x_tilde[i] - x[i])
+            f = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
+            if passes[0] >= STUBBORN:
+                # not settled: these stay where they are, and the next outer iteration starts from a stronger barrier
+                f = scalar(0.0)
+            fraction[i] = f
+            if passes[0] == 0:
+                first_fraction[i] = f
         if passes[0] >= MAX_PASSES:
-            # Not settled: nobody moves. Always feasible, and the next outer iteration starts from a stronger barrier.
+            # nobody moves, which is always feasible
             fraction[i] = scalar(0.0)
-            x_end_out[i] = x[i]
+
+    @wp.kernel(module=module)
+    def grade(
+        first: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        fraction_out: wp.array(dtype=scalar),
+    ):
+        """No vertex keeps so much more of its motion than a neighbour that the edge between them is strained by more than GRADE."""
+        i = first + wp.tid()
+        f = fraction[i]
+        own = wp.length(u_tilde[i] - u[i])
+        for e in range(offsets[i], offsets[i + 1]):
+            j = columns[e]
+            if fraction[j] < f:
+                motion = wp.max(own, wp.length(u_tilde[j] - u[j]))
+                f = wp.min(f, fraction[j] + scalar(GRADE) * wp.length(x[j] - x[i]) / wp.max(motion, scalar(1.0e-30)))
+        fraction_out[i] = f
+
+    @wp.kernel(module=module)
+    def place(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
+        x_end_out: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        if fraction[i] < scalar(1.0):
+            u_end_out[i] = u[i] + fraction[i] * (u_tilde[i] - u[i])
+            x_end_out[i] = base[i] + u_end_out[i]
 
     @wp.kernel(module=module)
     def decide(
@@ -162,15 +223,20 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module)
     def begin_pass(
         first: int,
-        x_tilde: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
         fraction_out: wp.array(dtype=scalar),
+        first_fraction_out: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
         passes_out: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
         i = first + wp.tid()
         fraction_out[i] = scalar(1.0)
-        x_end_out[i] = x_tilde[i]
+        first_fraction_out[i] = scalar(1.0)
+        u_end_out[i] = u_tilde[i]
+        x_end_out[i] = base[i] + u_tilde[i]
         if i == 0:
             passes_out[0] = 0
             going_out[0] = 1
@@ -179,9 +245,12 @@ def kernels(real: Real) -> SimpleNamespace:
         sweep_vertex_triangle=sweep("vertex_triangle"),
         sweep_edge_edge=sweep("edge_edge"),
         reset=reset,
+        clear=clear,
         spread=spread,
         together=together,
         shorten=shorten,
+        grade=grade,
+        place=place,
         decide=decide,
         begin_pass=begin_pass,
     )
@@ -190,30 +259,61 @@ def kernels(real: Real) -> SimpleNamespace:
 class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
-    rigid: (first, last) vertex ranges of obstacles that must stay rigid. x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
-    that each vertex keeps; passes: (1,) int32 on the device.
+    rigid: (first, last) vertex ranges of obstacles that must stay rigid. neighbours: offsets (n + 1,) and columns of those that elasticity
+    connects, or None. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
+    set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
+    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
     def __init__(self, device: Device, real: Real, n: int, rigid: list[tuple[int, int]], per_vertex: bool = True):
         self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
         self.kernels = kernels(real)
         self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
-        self.fraction = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.x_end = wp.zeros(n, dtype=real.vec3, device=device.warp)
+        self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
+        self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         ranges = rigid if per_vertex else [(0, n)]
+        self.body_count = 0
+        self.body = wp.full(n, -1, dtype=wp.int32, device=device.warp)
+        self.deep = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.neighbours: list[wp.array] | None = None
+        self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
         self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
         self.rigid_end = wp.array(np.array([last for _, last in ranges], dtype=np.int32), device=device.warp)
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
 
-    def truncate(self, candidates: Candidates, x: wp.array, x_tilde: wp.array) -> None:
-        """Fills x_end and `passes`, the number of passes that found hits: 0 where the whole motion is free. Recordable."""
+    def truncate(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
+        """Fills u_end, x_end = base + u_end and `passes`, the number of passes that found hits: 0 where the whole motion is free.
+
+        base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
+        """
+        if self.body_count:
+            self.device.launch(self.kernels.clear, self.body_count, [self.deep])
+        first = [self.fraction, self.first_fraction, self.u_end, self.x_end, self.passes, self.going]
+        self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, *first])
+        self.prove(candidates, base, u, u_tilde, x)
+
+    def prove(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
+        """The passes over the motion x -> x_end, with `fraction`, `u_end` and `x_end` as they are; `going` and `passes` say where to begin:
+        0 with all pairs, more with those of shortened vertices. Recordable.
+        """
         k, device, n = self.kernels, self.device, self.n
-        device.launch(k.begin_pass, n, [x_tilde, self.fraction, self.x_end, self.passes, self.going])
 
         def sweep() -> None:
             device.launch(k.reset, n, [self.multiplier, self.any_hit])
             for c in candidates.lists:
-                inputs = [c.count, x, self.x_end, self.fraction, self.passes, c.quads, c.limits, c.times, c.found]
+                inputs = [
+                    c.count,
+                    x,
+                    self.x_end,
+                    self.fraction,
+                    self.passes,
+                    c.quads,
+                    c.limits,
+                    self.body,
+                    c.times,
+                    c.found,
+                    self.deep,
+                ]
                 device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
                 inputs = [c.count, c.quads, c.times, c.found, self.multiplier, self.any_hit]
                 device.launch_scatter(k.spread, c.capacity, inputs)
@@ -223,7 +323,12 @@ class Truncation:
         def shorten() -> None:
             if len(self.rigid_begin):
                 device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
-            device.launch(k.shorten, n, [self.multiplier, self.passes, x, x_tilde, self.fraction, self.x_end])
+            device.launch(k.shorten, n, [self.multiplier, self.passes, self.fraction, self.first_fraction])
+            if self.neighbours is not None:
+                for _ in range(RINGS // 2):
+                    for before, after in ((self.fraction, self.graded), (self.graded, self.fraction)):
+                        device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
+            device.launch(k.place, n, [base, u, u_tilde, self.fraction, self.u_end, self.x_end])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
 

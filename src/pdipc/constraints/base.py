@@ -44,6 +44,27 @@ def make_set(kind: str, vertices, gradient, weight, **data: np.ndarray) -> Const
     return ConstraintSet(kind, vertices, gradient, weight, {name: np.asarray(value) for name, value in data.items()})
 
 
+def merge(sets: list[ConstraintSet]) -> list[ConstraintSet]:
+    """One set a kind, in the order in which the kinds first appear; elements keep their order."""
+    kinds: dict[str, list[ConstraintSet]] = {}
+    for s in sets:
+        kinds.setdefault(s.kind, []).append(s)
+
+    def together(parts: list[np.ndarray]) -> np.ndarray:
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    return [
+        ConstraintSet(
+            kind,
+            together([s.vertices for s in same]),
+            together([s.gradient for s in same]),
+            together([s.weight for s in same]),
+            {name: together([s.data[name] for s in same]) for name in same[0].data},
+        )
+        for kind, same in kinds.items()
+    ]
+
+
 def stiffness_matrix(count: int, sets: list[ConstraintSet]) -> scipy.sparse.csr_matrix:
     """(count, count): sum of w G^T G, the constant part of Eq. (3) without the mass; the same for the three coordinates."""
     matrix = scipy.sparse.csr_matrix((count, count))

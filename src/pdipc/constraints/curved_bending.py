@@ -16,6 +16,7 @@ from pdipc.device.precision import Real
 
 NAME = "curved_bending"
 CORNERS = 4
+PROJECTIVE = True
 arguments = rows.arguments
 
 
@@ -34,4 +35,4 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return rows.kernels(real, real.module(__name__), CORNERS, functions(real).project)
+    return rows.kernels(real, real.module(__name__), CORNERS, rows.keep_length)

@@ -14,6 +14,7 @@ from pdipc.device.precision import Real
 
 NAME = "edge_length"
 CORNERS = 2
+PROJECTIVE = True
 arguments = rows.arguments
 
 
@@ -35,4 +36,4 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return rows.kernels(real, real.module(__name__), CORNERS, functions(real).project)
+    return rows.kernels(real, real.module(__name__), CORNERS, rows.keep_length)

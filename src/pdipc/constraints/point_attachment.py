@@ -15,6 +15,7 @@ from pdipc.device.precision import Real
 
 NAME = "point_attachment"
 CORNERS = 1
+PROJECTIVE = True
 
 
 def rest(points: np.ndarray, vertices: np.ndarray, stiffness) -> ConstraintSet:
@@ -40,13 +41,14 @@ def kernels(real: Real) -> SimpleNamespace:
         vertices: wp.array(dtype=element),
         point: wp.array(dtype=vec3),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
         corners_out: wp.array(dtype=vec3),
     ):
         """w (p - x)."""
         e = first + wp.tid()
-        corners_out[offset + e] = weight[e] * (point[e] - x[vertices[e][0]])
+        corners_out[offset + e] = weight[e] * ((point[e] - base[vertices[e][0]]) - u[vertices[e][0]])
 
     @wp.kernel(module=module)
     def energy(
@@ -54,11 +56,16 @@ def kernels(real: Real) -> SimpleNamespace:
         vertices: wp.array(dtype=element),
         point: wp.array(dtype=vec3),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
-        energy_out: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=wp.float64),
     ):
         e = first + wp.tid()
-        energy_out[offset + e] = scalar(0.5) * weight[e] * wp.length_sq(x[vertices[e][0]] - point[e])
+        v = vertices[e][0]
+        d = wp.vec3d()
+        for k in range(3):
+            d[k] = wp.float64(point[e][k]) - wp.float64(base[v][k]) - wp.float64(u[v][k])
+        energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.length_sq(d)
 
     return SimpleNamespace(force=force, energy=energy)

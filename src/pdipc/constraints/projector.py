@@ -1,4 +1,4 @@
-"""The local step (Algorithm 1, line 9): all local projections at once, and what they pull at each vertex."""
+"""Elasticity: all constraints of a model at once, their local step (Algorithm 1, line 9), energies and Hessians."""
 
 import functools
 from types import SimpleNamespace
@@ -7,8 +7,10 @@ import numpy as np
 import warp as wp
 
 from pdipc.constraints import (
+    corotated,
     curved_bending,
     edge_length,
+    neo_hookean,
     point_attachment,
     quadratic_bending,
     tet_strain,
@@ -16,13 +18,16 @@ from pdipc.constraints import (
     triangle_area,
     triangle_strain,
 )
-from pdipc.constraints.base import ConstraintSet
+from pdipc.constraints.base import ConstraintSet, merge
 from pdipc.device.launch import Device, Reducer
 from pdipc.device.precision import Real
+from pdipc.device.precision import real as real_of
 
 KINDS = (
     tet_strain,
     tet_volume,
+    corotated,
+    neo_hookean,
     triangle_strain,
     triangle_area,
     edge_length,
@@ -33,8 +38,8 @@ KINDS = (
 
 
 @functools.cache
-def kernels(real: Real) -> SimpleNamespace:
-    vec3 = real.vec3
+def kernels_of(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
 
     @wp.kernel(module=real.module(__name__))
     def gather(
@@ -51,57 +56,92 @@ def kernels(real: Real) -> SimpleNamespace:
             total += corners[slots[k]]
         sum_out[i] = total
 
-    return SimpleNamespace(gather=gather)
+    @wp.kernel(module=real.module(__name__))
+    def store(first: int, total: wp.array(dtype=wp.float64), slot: int, out: wp.array(dtype=real.scalar)):
+        out[slot] = scalar(total[0])
+
+    return SimpleNamespace(gather=gather, store=store)
 
 
 class Projector:
-    """Local projections of `sets` over `n_vertices` vertices. count: number of elements ("# Con." of Table 1).
+    """The constraints `sets` over `n_vertices` vertices. count: number of elements ("# Con." of Table 1).
 
-    anchors: the points of attachments in the order of their sets, (k,) vec3 each; assign to them to move the points.
+    sets: one a kind, elements in the order of the bodies. bending: those of them whose Hessian depends on the state, in the order in
+    which their blocks are stored.
+    anchors: the points of attachments, (k,) vec3, or None; assign to it to move the points.
+    energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
+    blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row.
     """
 
     def __init__(self, device: Device, real: Real, n_vertices: int, sets: list[ConstraintSet]):
         known = {kind.NAME: kind for kind in KINDS}
         self.device, self.real, self.n = device, real, n_vertices
-        self.sets = [s for s in sets if len(s)]
-        self.count = sum(len(s) for s in self.sets)
-        self._batches = []
-        self.anchors: list[wp.array] = []
-        slot = element = 0
-        for s in self.sets:
+        for s in sets:
             if s.kind not in known:
                 raise ValueError(f'constraint kind "{s.kind}" is unknown; there are: {", ".join(known)}')
+        self.sets = merge([s for s in sets if len(s)])
+        self.count = sum(len(s) for s in self.sets)
+        self.projective = all(known[s.kind].PROJECTIVE for s in self.sets)
+        self._batches = []
+        self.bending: list[ConstraintSet] = []
+        self.anchors: wp.array | None = None
+        slot = element = block = 0
+        for s in self.sets:
             kind = known[s.kind]
             vector = wp.types.vector(kind.CORNERS, wp.int32)
             rest = kind.arguments(device, real, s)
             if kind is point_attachment:
-                self.anchors.append(rest[0])
+                self.anchors = rest[0]
             arrays = [wp.array(s.vertices, dtype=vector, device=device.warp), *rest]
             arrays.append(wp.array(s.weight, dtype=real.scalar, device=device.warp))
-            self._batches.append((kind.kernels(real), len(s), arrays, slot, element))
+            kernels = kind.kernels(real)
+            self._batches.append((kernels, len(s), arrays, slot, element, block))
             slot += s.vertices.size
             element += len(s)
+            if hasattr(kernels, "hessian"):
+                self.bending.append(s)
+                block += len(s) * kind.CORNERS * (kind.CORNERS + 1) // 2
         vertices = np.concatenate([np.zeros(0, dtype=np.int32), *(s.vertices.ravel() for s in self.sets)])
         order = np.argsort(vertices, kind="stable").astype(np.int32)
         offsets = np.searchsorted(vertices[order], np.arange(n_vertices + 1)).astype(np.int32)
         self._offsets = wp.array(offsets, device=device.warp)
         self._slots = wp.array(np.append(order, 0).astype(np.int32), device=device.warp)
         self._corners = wp.zeros(max(1, slot), dtype=real.vec3, device=device.warp)
-        self._energies = wp.zeros(max(1, element), dtype=real.scalar, device=device.warp)
-        self._sum = Reducer(device, real, element)
-        self._gather = kernels(real).gather
+        self.energies = wp.zeros(max(1, element), dtype=wp.float64, device=device.warp)
+        self.block_count = block
+        self._kernels = kernels_of(real)
+        self._sum, self._total = Reducer(device, real_of("float64"), element), wp.zeros(1, dtype=wp.float64, device=device.warp)
 
-    def add_forces(self, x: wp.array, force_out: wp.array, base: wp.array) -> None:
-        """force_out = base + sum over elements of w G^T (p - G x): the right-hand side of Eq. (3) less A x, without mass.
+    @functools.cached_property
+    def blocks(self) -> wp.array:
+        """Made when first asked for: only a solver that uses Hessians needs the room."""
+        return wp.zeros(max(1, self.block_count), dtype=self.real.mat33, device=self.device.warp)
+
+    def add_forces(self, base: wp.array, u: wp.array, force_out: wp.array, force: wp.array) -> None:
+        """force_out = force + sum over elements of w G^T (p - G x) at x = base + u, for kinds with a projection the right-hand side of
+        Eq. (3) less A x, without mass.
 
         Every corner writes to a place of its own and every vertex gathers its own: no atomics. Recordable.
         """
-        for kind, count, arrays, slot, _ in self._batches:
-            self.device.launch(kind.force, count, [*arrays, x, slot, self._corners], grain=16)
-        self.device.launch(self._gather, self.n, [base, self._offsets, self._slots, self._corners, force_out], grain=8)
+        for kind, count, arrays, slot, _, _ in self._batches:
+            self.device.launch(kind.force, count, [*arrays, base, u, slot, self._corners], grain=16)
+        self.device.launch(self._kernels.gather, self.n, [force, self._offsets, self._slots, self._corners, force_out], grain=8)
 
-    def energy(self, x: wp.array, out: wp.array, slot: int) -> None:
-        """out[slot] = Psi(x), J: the sum of all elements' energies. Recordable."""
-        for kind, count, arrays, _, element in self._batches:
-            self.device.launch(kind.energy, count, [*arrays, x, element, self._energies], grain=16)
-        self._sum.sum(self._energies, out, slot)
+    def evaluate(self, base: wp.array, u: wp.array) -> None:
+        """Fills `energies` at x = base + u. Recordable."""
+        for kind, count, arrays, _, element, _ in self._batches:
+            self.device.launch(kind.energy, count, [*arrays, base, u, element, self.energies], grain=16)
+
+    def energy(self, base: wp.array, u: wp.array, out: wp.array, slot: int) -> None:
+        """out[slot] = Psi, J, at x = base + u, in the scene's precision. Recordable."""
+        self.evaluate(base, u)
+        self._sum.sum(self.energies, self._total)
+        self.device.launch_serial(self._kernels.store, [self._total, slot, out])
+
+    def differentiate(self, base: wp.array, u: wp.array, project: wp.array) -> None:
+        """Fills `blocks`: the Hessians at x = base + u; project: (1,) int32 on the device, whether each is to be positive semidefinite.
+        Recordable.
+        """
+        for kind, count, arrays, _, _, block in self._batches:
+            if hasattr(kind, "hessian"):
+                self.device.launch(kind.hessian, count, [*arrays, base, u, block, project, self.blocks], grain=64)

@@ -18,6 +18,7 @@ from pdipc.device.precision import Real
 
 NAME = "quadratic_bending"
 CORNERS = 4
+PROJECTIVE = True
 arguments = rows.arguments
 
 
@@ -69,4 +70,4 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return rows.kernels(real, real.module(__name__), CORNERS, functions(real).project)
+    return rows.kernels(real, real.module(__name__), CORNERS, lambda of: functions(of).project, bends=False)

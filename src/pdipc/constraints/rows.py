@@ -5,9 +5,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
+from pdipc.device.precision import kernel as named
+from pdipc.device.precision import real as real_of
 
 
 def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
@@ -31,51 +34,101 @@ def keep_length(real: Real) -> Callable:
     return project
 
 
-def kernels(real: Real, module: wp.Module, corners: int, project: Callable) -> SimpleNamespace:
-    """Force and energy; `project(G x, length)` is the local projection."""
-    scalar, vec3 = real.scalar, real.vec3
+def kernels(
+    real: Real, module: wp.Module, corners: int, project_of: Callable[[Real], Callable], bends: bool = True
+) -> SimpleNamespace:
+    """Force and energy; project_of(real) makes project(G x, length), the local projection.
+
+    bends: whether the projection depends on G x; without, the Hessian is w G^T G, which does not change, and no kernel is made.
+    """
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     row = wp.types.vector(corners, scalar)
     element = wp.types.vector(corners, wp.int32)
     count = wp.constant(corners)
+    blocks = wp.constant(corners * (corners + 1) // 2)
+    project, wide_project = project_of(real), project_of(real_of("float64"))
+    edges = tets.functions(real)
+    wide = wp.float64
 
     @wp.func
-    def combined(x: wp.array(dtype=vec3), v: element, g: row) -> vec3:
+    def combined(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: element, g: row) -> vec3:
+        """G x; the g_c add up to zero, so it is a sum over differences."""
         total = vec3()
-        for c in range(count):
-            total += g[c] * x[v[c]]
+        for c in range(1, count):
+            total += g[c] * edges.edge(base, u, v[0], v[c])
         return total
 
-    @wp.kernel(module=module)
+    @named(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=element),
         g: wp.array(dtype=row),
         length: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
         corners_out: wp.array(dtype=vec3),
     ):
         """w G^T (p - G x) at the corners."""
         e = first + wp.tid()
-        q = combined(x, vertices[e], g[e])
+        q = combined(base, u, vertices[e], g[e])
         d = weight[e] * (project(q, length[e]) - q)
         for c in range(count):
             corners_out[offset + count * e + c] = g[e][c] * d
 
-    @wp.kernel(module=module)
+    @named(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=element),
         g: wp.array(dtype=row),
         length: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
-        energy_out: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=wp.float64),
     ):
         e = first + wp.tid()
-        q = combined(x, vertices[e], g[e])
-        energy_out[offset + e] = scalar(0.5) * weight[e] * wp.length_sq(q - project(q, length[e]))
+        q = wp.vec3d()
+        for c in range(1, count):
+            q += wide(g[e][c]) * edges.wide_edge(base, u, vertices[e][0], vertices[e][c])
+        energy_out[offset + e] = wide(0.5) * wide(weight[e]) * wp.length_sq(q - wide_project(q, wide(length[e])))
 
-    return SimpleNamespace(force=force, energy=energy)
+    if not bends:
+        return SimpleNamespace(force=force, energy=energy)
+
+    @named(module, "hessian")
+    def hessian(
+        first: int,
+        vertices: wp.array(dtype=element),
+        g: wp.array(dtype=row),
+        length: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        offset: int,
+        project: wp.array(dtype=wp.int32),
+        blocks_out: wp.array(dtype=mat33),
+    ):
+        """w g_a g_b (d d^T + (1 - L / |q|) (I - d d^T)), q = G x and d = q / |q|: one along it, and
+        across what tension gives, or compression takes, which projection drops."""
+        e = first + wp.tid()
+        q = combined(base, u, vertices[e], g[e])
+        size = wp.length(q)
+        h = mat33(wp.identity(n=3, dtype=scalar))
+        if size > scalar(0.0):
+            d = q / size
+            across = scalar(1.0) - length[e] / size
+            if project[0] != 0:
+                across = wp.max(scalar(0.0), across)
+            h = across * h + (scalar(1.0) - across) * wp.outer(d, d)
+        elif length[e] > scalar(0.0):
+            h = mat33()
+        at = offset + blocks * e
+        for a in range(count):
+            for b in range(a, count):
+                blocks_out[at] = (weight[e] * g[e][a] * g[e][b]) * h
+                at += 1
+
+    return SimpleNamespace(force=force, energy=energy, hessian=hessian)

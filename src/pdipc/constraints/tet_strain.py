@@ -4,6 +4,7 @@ import functools
 from types import SimpleNamespace
 
 import numpy as np
+import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
@@ -11,6 +12,7 @@ from pdipc.device.precision import Real
 
 NAME = "tet_strain"
 CORNERS = tets.CORNERS
+PROJECTIVE = True
 arguments = tets.arguments
 
 
@@ -19,11 +21,32 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, weight_per_volume) ->
     return tets.make(NAME, rest_positions, vertices, weight_per_volume)
 
 
-def functions(real: Real) -> SimpleNamespace:
+def project_of(real: Real):
     """project(F): the nearest rotation."""
-    return SimpleNamespace(project=rotation.functions(real).nearest_rotation)
+    return rotation.functions(real).nearest_rotation
+
+
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    """project(F); principal(s, mu, lame): W = sum (s_i - 1)^2 / 2."""
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    one = wp.constant(scalar(1.0))
+    two = wp.constant(scalar(2.0))
+    least = wp.constant(scalar(1.0e-6))
+
+    @wp.func
+    def principal(s: vec3, mu: scalar, lame: scalar):
+        twist = vec3(
+            one - two / wp.max(s[1] + s[2], least),
+            one - two / wp.max(s[0] + s[2], least),
+            one - two / wp.max(s[0] + s[1], least),
+        )
+        identity = wp.identity(n=3, dtype=scalar)
+        return mat33(identity), twist, vec3(one, one, one)
+
+    return SimpleNamespace(project=project_of(real), principal=principal)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return tets.kernels(real, real.module(__name__), functions(real).project)
+    return tets.projective(real, real.module(__name__), project_of, functions(real).principal)

@@ -16,6 +16,7 @@ from pdipc.device.precision import Real
 
 NAME = "triangle_strain"
 CORNERS = triangles.CORNERS
+PROJECTIVE = True
 arguments = triangles.arguments
 
 
@@ -26,8 +27,9 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, weight_per_area) -> C
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    """project(f1, f2): the columns of the nearest isometry as rows."""
-    scalar, vec3 = real.scalar, real.vec3
+    """project(f1, f2): the columns of the nearest isometry as rows. principal(s1, s2): W = ((s1 - 1)^2 + (s2 - 1)^2) / 2."""
+    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
+    one, least = wp.constant(scalar(1.0)), wp.constant(scalar(1.0e-6))
     mat23 = wp.types.matrix((2, 3), scalar)
     normal = triangles.normal_function(real)
 
@@ -45,9 +47,20 @@ def functions(real: Real) -> SimpleNamespace:
             p2 = vec3(scalar(0.0), scalar(1.0), scalar(0.0))
         return mat23(p1[0], p1[1], p1[2], p2[0], p2[1], p2[2])
 
-    return SimpleNamespace(project=project)
+    @wp.func
+    def principal(s1: scalar, s2: scalar):
+        twist = one - scalar(2.0) / wp.max(s1 + s2, least)
+        tilt = vec2(one - one / wp.max(s1, least), one - one / wp.max(s2, least))
+        return vec3(one, scalar(0.0), one), vec2(twist, one), tilt
+
+    return SimpleNamespace(project=project, principal=principal)
+
+
+def project_of(real: Real):
+    """project(f1, f2): the nearest isometry."""
+    return functions(real).project
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return triangles.kernels(real, real.module(__name__), functions(real).project)
+    return triangles.kernels(real, real.module(__name__), project_of, functions(real).principal)

@@ -1,14 +1,18 @@
 """Constraints on the 3x2 deformation gradient of a triangle: F = [x1 - x0, x2 - x0] Dm^-1, Dm in the triangle's own plane."""
 
+import functools
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 
+from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
+from pdipc.device.precision import kernel as named
+from pdipc.device.precision import real as real_of
 
 CORNERS = 3
 
@@ -46,35 +50,63 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
     return [wp.array(s.data["inverse"], dtype=real.mat22, device=device.warp)]
 
 
-def kernels(real: Real, module: wp.Module, project: Callable) -> SimpleNamespace:
-    """Force and energy of triangles; `project(f1, f2)` gives the two columns of P as rows of a 2x3 matrix."""
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    """Deformation gradients of triangles, their columns f1 and f2, in the scene's precision and in double."""
     scalar, vec3, mat22 = real.scalar, real.vec3, real.mat22
+    edges = tets.functions(real)
     mat23 = wp.types.matrix((2, 3), scalar)
+    wide = wp.float64
+    wide23 = wp.types.matrix((2, 3), wide)
 
     @wp.func
-    def difference(x: wp.array(dtype=vec3), t: wp.vec3i, b: mat22) -> mat23:
-        """P - F, its columns as rows."""
-        e1 = x[t[1]] - x[t[0]]
-        e2 = x[t[2]] - x[t[0]]
+    def deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), t: wp.vec3i, b: mat22) -> mat23:
+        """The columns of F as rows."""
+        e1 = edges.edge(base, u, t[0], t[1])
+        e2 = edges.edge(base, u, t[0], t[2])
         f1 = b[0, 0] * e1 + b[1, 0] * e2
         f2 = b[0, 1] * e1 + b[1, 1] * e2
-        p = project(f1, f2)
-        return mat23(p[0, 0] - f1[0], p[0, 1] - f1[1], p[0, 2] - f1[2], p[1, 0] - f2[0], p[1, 1] - f2[1], p[1, 2] - f2[2])
+        return mat23(f1[0], f1[1], f1[2], f2[0], f2[1], f2[2])
 
-    @wp.kernel(module=module)
+    @wp.func
+    def wide_deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), t: wp.vec3i, b: mat22) -> wide23:
+        e1 = edges.wide_edge(base, u, t[0], t[1])
+        e2 = edges.wide_edge(base, u, t[0], t[2])
+        f1 = wide(b[0, 0]) * e1 + wide(b[1, 0]) * e2
+        f2 = wide(b[0, 1]) * e1 + wide(b[1, 1]) * e2
+        return wide23(f1[0], f1[1], f1[2], f2[0], f2[1], f2[2])
+
+    return SimpleNamespace(deformation=deformation, wide_deformation=wide_deformation)
+
+
+def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable], principal: Callable) -> SimpleNamespace:
+    """Force, energy and Hessian of triangles of the energy |F - P|^2 / 2.
+
+    project_of(real): makes project(f1, f2), the two columns of P as rows of a 2x3 matrix. principal(s1, s2): see `tets`; the stretch
+    W_11, W_12, W_22, then what it costs to twist, to flip, and per axis to tilt out of the plane, W_i / s_i.
+    """
+    scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
+    wp.types.matrix((2, 3), scalar)
+    project, wide_project = project_of(real), project_of(real_of("float64"))
+    f_of, normal = functions(real), normal_function(real)
+    zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
+
+    @named(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
         inverse: wp.array(dtype=mat22),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
         corners_out: wp.array(dtype=vec3),
     ):
         """w G^T (p - G x) at the three corners."""
         e = first + wp.tid()
         b = inverse[e]
-        d = difference(x, vertices[e], b)
+        f = f_of.deformation(base, u, vertices[e], b)
+        d = project(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2])) - f
         d1 = weight[e] * vec3(d[0, 0], d[0, 1], d[0, 2])
         d2 = weight[e] * vec3(d[1, 0], d[1, 1], d[1, 2])
         g1 = b[0, 0] * d1 + b[0, 1] * d2
@@ -84,21 +116,104 @@ def kernels(real: Real, module: wp.Module, project: Callable) -> SimpleNamespace
         corners_out[corner + 1] = g1
         corners_out[corner + 2] = g2
 
-    @wp.kernel(module=module)
+    @named(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
         inverse: wp.array(dtype=mat22),
         weight: wp.array(dtype=scalar),
-        x: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
         offset: int,
-        energy_out: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=wp.float64),
     ):
         e = first + wp.tid()
-        d = difference(x, vertices[e], inverse[e])
-        energy_out[offset + e] = scalar(0.5) * weight[e] * wp.ddot(d, d)
+        f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
+        d = wide_project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
+        energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.ddot(d, d)
 
-    return SimpleNamespace(force=force, energy=energy)
+    @wp.func
+    def block(k: vec3, p: scalar, q: scalar, tilt: vec2, u1: vec3, u2: vec3, n: vec3, a: vec2, b: vec2) -> mat33:
+        """The Hessian between two corners of gradients a and b in the axes of the singular values."""
+        h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
+        h12 = k[1] * a[0] * b[1] + q * a[1] * b[0]
+        h21 = k[1] * a[1] * b[0] + q * a[0] * b[1]
+        h22 = k[2] * a[1] * b[1] + p * a[0] * b[0]
+        hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
+        return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
+
+    @named(module, "hessian")
+    def hessian(
+        first: int,
+        vertices: wp.array(dtype=wp.vec3i),
+        inverse: wp.array(dtype=mat22),
+        weight: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        offset: int,
+        project: wp.array(dtype=wp.int32),
+        blocks_out: wp.array(dtype=mat33),
+    ):
+        """The six blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
+        e = first + wp.tid()
+        b = inverse[e]
+        f = f_of.deformation(base, u, vertices[e], b)
+        f1 = vec3(f[0, 0], f[0, 1], f[0, 2])
+        f2 = vec3(f[1, 0], f[1, 1], f[1, 2])
+        n = normal(f1, f2)
+        # F^T F = V diag(s^2) V^T; s1 and s2 follow from their sum and difference of squares without cancellation
+        c11 = wp.dot(f1, f1)
+        c12 = wp.dot(f1, f2)
+        c22 = wp.dot(f2, f2)
+        angle = half * wp.atan2(scalar(2.0) * c12, c11 - c22)
+        c = wp.cos(angle)
+        s = wp.sin(angle)
+        h1 = c * f1 + s * f2
+        h2 = c * f2 - s * f1
+        s1 = wp.length(h1)
+        s2 = wp.length(h2)
+        u1 = wp.normalize(h1)
+        u2 = wp.cross(n, u1)
+        if s1 < s2:
+            u2 = wp.normalize(h2)
+            u1 = wp.cross(u2, n)
+        k, pair, tilt = principal(s1, s2)
+        # the positive part of the stretch, twist, flip and tilt
+        mean = half * (k[0] + k[2])
+        spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
+        low = mean - spread
+        if low < zero and project[0] != 0:
+            high = wp.max(mean + spread, zero)
+            # high times the projector on its eigenvector
+            cosine = zero
+            sine = zero
+            if spread > zero:
+                cosine = half * (k[0] - k[2]) / spread
+                sine = k[1] / spread
+            k = half * high * vec3(one + cosine, sine, one - cosine)
+        w = weight[e]
+        k = w * k
+        t = pair[0]
+        flip = pair[1]
+        if project[0] != 0:
+            t = wp.max(t, zero)
+            flip = wp.max(flip, zero)
+            tilt = vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
+        p = half * w * (flip + t)
+        q = half * w * (flip - t)
+        out = w * tilt
+        g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
+        g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])
+        g0 = -(g1 + g2)
+        at = offset + 6 * e
+        blocks_out[at] = block(k, p, q, out, u1, u2, n, g0, g0)
+        blocks_out[at + 1] = block(k, p, q, out, u1, u2, n, g0, g1)
+        blocks_out[at + 2] = block(k, p, q, out, u1, u2, n, g0, g2)
+        blocks_out[at + 3] = block(k, p, q, out, u1, u2, n, g1, g1)
+        blocks_out[at + 4] = block(k, p, q, out, u1, u2, n, g1, g2)
+        blocks_out[at + 5] = block(k, p, q, out, u1, u2, n, g2, g2)
+
+    return SimpleNamespace(force=force, energy=energy, hessian=hessian)
 
 
 def normal_function(real: Real):

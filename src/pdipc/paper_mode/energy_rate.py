@@ -76,16 +76,25 @@ def kernels(real: Real) -> SimpleNamespace:
 class EnergyRate:
     """The loop of local-global iterations in the paper's form; the same names as `Anderson`.
 
-    x, z: (n,) m, buffers of the step: where the outer iteration starts, and the inertial target.
+    base, x, z: (n,) m, buffers of the step: where it starts, and as displacements from there where the outer iteration starts, and the
+    inertial target.
     energies: (5,) on the device, of the last iterate: E, Psi, B and their sum, J; and its largest motion, m.
     """
 
     def __init__(
-        self, device: Device, real: Real, projector: Projector, pairs: PaperPairs, x: wp.array, z: wp.array, mass: wp.array
+        self,
+        device: Device,
+        real: Real,
+        projector: Projector,
+        pairs: PaperPairs,
+        base: wp.array,
+        x: wp.array,
+        z: wp.array,
+        mass: wp.array,
     ):
         n = len(mass)
         self.device, self.real, self.kernels = device, real, kernels(real)
-        self.projector, self.pairs, self.x, self.z, self.mass = projector, pairs, x, z, mass
+        self.projector, self.pairs, self.base, self.x, self.z, self.mass = projector, pairs, base, x, z, mass
         self.per_vertex, self.reducer = wp.zeros(n, dtype=real.scalar, device=device.warp), Reducer(device, real, n)
         self.lengths = wp.zeros(n, dtype=real.scalar, device=device.warp)
         self.energies = wp.zeros(5, dtype=real.scalar, device=device.warp)
@@ -103,7 +112,7 @@ class EnergyRate:
         device.launch(k.move, n, inputs)
         self.reducer.sum(self.per_vertex, self.energies, MOMENTUM)
         self.reducer.max(self.lengths, self.energies, MOVED)
-        self.projector.energy(x_tilde, self.energies, ELASTIC)
+        self.projector.energy(self.base, x_tilde, self.energies, ELASTIC)
         self.pairs.vertex_energy(self.x, x_tilde, self.per_vertex)
         self.reducer.sum(self.per_vertex, self.energies, BARRIER)
         counters = [self.left, self.done, self.moved, self.going]

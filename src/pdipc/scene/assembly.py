@@ -122,7 +122,9 @@ class Assembly:
     positions: (n, 3) at the start, m. rest_positions: (n, 3) at rest, placed where the body starts, m.
     velocities: (n, 3) at the start, m/s; zero for what is kinematic. body_of_vertex: (n,) int32, index into `bodies`.
     scene_size: L, the diagonal of the bounding box of all deformable bodies at the start, m.
-    activation_distance: d_hat, m; 1e-3 L unless the scene says otherwise.
+    body_sizes: diagonals of the smallest and the largest deformable body's own bounding box at the start, m. What a scene leaves open
+    follows from these, not from L: a distant partner changes nothing.
+    activation_distance: d_hat, m; 1e-3 of the largest body unless the scene says otherwise.
     minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
     notes: what was left out of files, or converted, a line each.
     """
@@ -133,6 +135,7 @@ class Assembly:
     bodies: list[AssembledBody]
     body_of_vertex: np.ndarray
     scene_size: float
+    body_sizes: tuple[float, float]
     activation_distance: float
     minimum_separation: float
     pins: list[AssembledPin] = field(default_factory=list)
@@ -367,7 +370,8 @@ def gather(
     positions = np.concatenate([part[3] for part in parts])
     deformable = positions[: max(body.last for body in bodies if not body.kinematic)]
     scene_size = float(np.linalg.norm(np.ptp(deformable, axis=0)))
-    activation_distance = scene.contact.activation_distance or ACTIVATION_PART * scene_size
+    sizes = [float(np.linalg.norm(np.ptp(positions[b.first : b.last], axis=0))) for b in bodies if not b.kinematic]
+    activation_distance = scene.contact.activation_distance or ACTIVATION_PART * max(sizes)
     minimum_separation = scene.contact.minimum_separation or SEPARATION_PART * activation_distance
     assembly = Assembly(
         positions,
@@ -376,6 +380,7 @@ def gather(
         bodies,
         np.repeat(np.arange(len(bodies), dtype=np.int32), [body.last - body.first for body in bodies]),
         scene_size,
+        (min(sizes), max(sizes)),
         activation_distance,
         minimum_separation,
         notes=notes,

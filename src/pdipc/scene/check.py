@@ -108,7 +108,7 @@ def smallest_separation(assembly: Assembly, precision: str) -> float:
 
 def smallest_activation(assembly: Assembly, precision: str) -> float:
     """The least activation distance, m, with which the speeds that contact leaves mean something in "float32" or "float64"."""
-    return max(ACTIVATION_PART * assembly.scene_size, ACTIVATION_ULPS * _rounding(assembly, precision))
+    return max(ACTIVATION_PART * assembly.body_sizes[1], ACTIVATION_ULPS * _rounding(assembly, precision))
 
 
 def _rounding(assembly: Assembly, precision: str) -> float:
@@ -293,7 +293,7 @@ def _activation(assembly: Assembly, precision: str) -> Iterator[Finding]:
     if given < least:
         found = f"{given:.3g} m is so short a range that rounding decides how strongly surfaces push each other apart"
         right = (
-            f"it must be at least {least:.3g} m: {ACTIVATION_PART:g} of the scene size of {assembly.scene_size:.4g} m, and "
+            f"it must be at least {least:.3g} m: {ACTIVATION_PART:g} of the largest body's size of {assembly.body_sizes[1]:.4g} m, and "
             f"{ACTIVATION_ULPS} roundings of {precision} coordinates up to {np.abs(assembly.positions).max():.4g} m"
         )
         yield Finding("contact.activation_distance", found, right)

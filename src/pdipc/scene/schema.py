@@ -70,14 +70,24 @@ class Simulation(Table):
         default="auto", description='Working precision; "auto" takes what measured faster on the device.'
     )
     device: str | None = Field(default=None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
-    outer_tolerance: Positive = Field(
-        default=1e-4,
+    tolerance: Positive | None = Field(
+        default=None,
+        le=100.0,
+        description="A step has converged when its error is below this speed times the time step, m/s. Absent: 0.01 m/s, as strict as what "
+        "other IPC simulators ship, or a thousandth of the smallest body's size a step where that is less.",
+    )
+    outer_tolerance: Positive | None = Field(
+        default=None,
         le=1.0,
-        description="A step has converged when an outer iteration moves no vertex further than this part of the scene size. "
-        "The default is what is customary for IPC at h = 1/100 s; for comparisons with exact solutions take 1e-5 or less.",
+        description="The tolerance in another unit: a part of the largest body's size. Not beside `tolerance`.",
+    )
+    nonlinear_solver: Literal["auto", "newton", "local-global"] = Field(
+        default="auto",
+        description='How the nonlinear problem of a step is solved; "auto" is newton, unless a setting of local-global '
+        "(inner_iterations, linear_solver, linear_iterations, linear_tolerance, solver_order, solver_drop) is given.",
     )
     max_outer: Whole = Field(
-        default=50,
+        default=100,
         ge=1,
         le=10**6,
         description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
@@ -312,6 +322,12 @@ class SolidMaterial(Table):
     density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
     young_modulus: Positive = Field(default=1e5, le=1e12, description="Young's modulus, Pa.")
     poisson_ratio: Real = Field(default=0.4, ge=0, le=0.499, description="Poisson's ratio.")
+    model: Literal["auto", "arap", "corotated", "neo_hookean"] = Field(
+        default="auto",
+        description="The elastic energy; all are Hooke's law for small strains. arap: the paper's constraints of strain and volume; "
+        "corotated and neo_hookean stay smooth where elements are flattened or inverted, and need the Newton solver. auto: "
+        "neo_hookean with the Newton solver, else arap.",
+    )
 
 
 class ClothMaterial(Table):

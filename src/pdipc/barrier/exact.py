@@ -1,0 +1,418 @@
+"""The barrier as Newton's method needs it: gradient and positive semidefinite Hessian of the true potential, pair by pair.
+
+    B = kappa m(c) b(d),   d the distance less xi,   c the squared sine of an edge pair over its threshold
+
+By the envelope theorem grad_i d = a_i n. Without a mollifier the Hessian is kappa b'' (a n)(a n)^T, one direction a pair, and what turns n and
+moves the witness points,
+
+    kappa b' hess d,   |r| hess d = a a^T (I - n n^T) - sum_k q_k q_k^T,   q = C^(-1/2) B,  C = r_t^T r_t,  B = r_t^T (a I) + r^T (da/dt),
+
+with t the parameters of the witness points that lie inside an edge or a triangle, and r_t = dr/dt. As b' < 0 that is negative for the most part: it is
+left out where the Hessian is projected, and of the preconditioner.
+With a mollifier B is a function of d and c, whose 2x2 Hessian has one positive eigenvalue: after projection such a pair has one direction, too.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.barrier import potential as barrier
+from pdipc.barrier.pairs import ActivePairs
+from pdipc.device.launch import Span
+from pdipc.device.precision import Real
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    mat43 = wp.types.matrix((4, 3), scalar)
+    module = real.module(__name__)
+    bar = barrier.functions(real)
+    zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
+
+    @wp.func
+    def row(m: mat43, s: int) -> vec3:
+        return vec3(m[s, 0], m[s, 1], m[s, 2])
+
+    @wp.func
+    def free_directions(a: vec4, edges: bool):
+        """da/dt of the parameters of the witness points that are not at an end."""
+        d1 = vec4()
+        d2 = vec4()
+        if edges:
+            if a[0] > zero and a[1] > zero:
+                d1[0] = -one
+                d1[1] = one
+            if a[2] < zero and a[3] < zero:
+                d2[2] = one
+                d2[3] = -one
+        else:
+            # from the first corner with a part to each later one
+            if a[1] < zero:
+                if a[2] < zero:
+                    d1[1] = one
+                    d1[2] = -one
+                if a[3] < zero:
+                    d2[1] = one
+                    d2[3] = -one
+            elif a[2] < zero and a[3] < zero:
+                d1[2] = one
+                d1[3] = -one
+        return d1, d2
+
+    @wp.kernel(module=module)
+    def differentiate(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        stiffness: wp.array(dtype=scalar),
+        energy_out: wp.array(dtype=wp.float64),
+        slope_out: wp.array(dtype=mat43),
+        lever_out: wp.array(dtype=mat43),
+        hessian_out: wp.array(dtype=scalar),
+        bend_out: wp.array(dtype=scalar),
+        first_out: wp.array(dtype=mat43),
+        second_out: wp.array(dtype=mat43),
+    ):
+        """Energy, J; its gradient, N, at the four vertices; and the direction and curvature, N/m, of the Hessian."""
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                a = weights[k]
+                n = normals[k]
+                d = gaps[k]
+                d_hat = activation[k]
+                km = stiffness[k]
+                b1 = bar.barrier_gradient(d, d_hat)
+                b2 = bar.barrier_hessian(d, d_hat)
+                slope = mat43()
+                lever = mat43()
+                hessian = km * b2
+                for s in range(4):
+                    for axis in range(3):
+                        lever[s, axis] = a[s] * n[axis]
+                        slope[s, axis] = km * b1 * a[s] * n[axis]
+                # in double precision: what tells two iterates apart may be far below one energy
+                q = quads[k]
+                bend = zero
+                first_bent = mat43()
+                second_bent = mat43()
+                energy = wp.float64(km) * bar.wide_barrier(wp.float64(d), wp.float64(d_hat))
+                plain = True
+                if k >= count[2]:
+                    e1 = x[q[1]] - x[q[0]]
+                    e2 = x[q[3]] - x[q[2]]
+                    c, g1, g2 = bar.parallel_gradient(e1, e2)
+                    if c < one and c > zero:
+                        plain = False
+                        m = c * (two - c)
+                        kappa = km / m
+                        b0 = bar.barrier(d, d_hat)
+                        slant = two - two * c
+                        # the two gradients: a n, and that of c, which is (-g1, g1, -g2, g2)
+                        turn = mat43(
+                            -g1[0], -g1[1], -g1[2],
+                            g1[0], g1[1], g1[2],
+                            -g2[0], -g2[1], -g2[2],
+                            g2[0], g2[1], g2[2],
+                        )  # fmt: skip
+                        slope += (kappa * b0 * slant) * turn
+                        alpha = wp.sqrt(wp.ddot(lever, lever))
+                        beta = wp.ddot(lever, turn) / alpha
+                        rest = turn - (beta / alpha) * lever
+                        gamma = wp.sqrt(wp.ddot(rest, rest))
+                        s_dd = m * b2
+                        s_dc = b1 * slant
+                        s_cc = -two * b0
+                        h11 = alpha * alpha * s_dd + two * alpha * beta * s_dc + beta * beta * s_cc
+                        h12 = gamma * (alpha * s_dc + beta * s_cc)
+                        h22 = gamma * gamma * s_cc
+                        half = scalar(0.5) * (h11 - h22)
+                        spread = wp.sqrt(half * half + h12 * h12)
+                        largest = scalar(0.5) * (h11 + h22) + spread
+                        v1 = one
+                        v2 = zero
+                        if gamma > zero and wp.abs(h12) > zero:
+                            # of the two forms of the eigenvector the one without cancellation
+                            if half >= zero:
+                                v1 = half + spread
+                                v2 = h12
+                            else:
+                                v1 = h12
+                                v2 = spread - half
+                            size = wp.sqrt(v1 * v1 + v2 * v2)
+                            v1 = v1 / size
+                            v2 = v2 / (size * gamma)
+                        else:
+                            largest = h11
+                        lever = (v1 / alpha) * lever + v2 * rest
+                        hessian = kappa * wp.max(largest, zero)
+                if plain:
+                    d1, d2 = free_directions(a, k >= count[2])
+                    x0 = x[q[0]]
+                    p1 = x[q[1]] - x0
+                    p2 = x[q[2]] - x0
+                    p3 = x[q[3]] - x0
+                    r = a[1] * p1 + a[2] * p2 + a[3] * p3
+                    r1 = d1[1] * p1 + d1[2] * p2 + d1[3] * p3
+                    r2 = d2[1] * p1 + d2[2] * p2 + d2[3] * p3
+                    distance = wp.length(r)
+                    if distance > zero:
+                        bend = -km * b1 / distance
+                    # Cholesky of C; a parameter that is not free has no direction
+                    c11 = wp.dot(r1, r1)
+                    c12 = wp.dot(r1, r2)
+                    c22 = wp.dot(r2, r2)
+                    if c11 > zero:
+                        l11 = wp.sqrt(c11)
+                        for s in range(4):
+                            for axis in range(3):
+                                first_bent[s, axis] = (a[s] * r1[axis] + d1[s] * r[axis]) / l11
+                        c22 = c22 - c12 * c12 / c11
+                    if c22 > scalar(1.0e-6) * wp.dot(r2, r2):
+                        l22 = wp.sqrt(c22)
+                        l21 = zero
+                        if c11 > zero:
+                            l21 = c12 / wp.sqrt(c11)
+                        for s in range(4):
+                            for axis in range(3):
+                                own = a[s] * r2[axis] + d2[s] * r[axis]
+                                second_bent[s, axis] = (own - l21 * first_bent[s, axis]) / l22
+                    elif wp.dot(r2, r2) > zero:
+                        bend = zero
+                bend_out[k] = bend
+                first_out[k] = first_bent
+                second_out[k] = second_bent
+                energy_out[k] = energy
+                slope_out[k] = slope
+                lever_out[k] = lever
+                hessian_out[k] = hessian
+
+    @wp.kernel(module=module)
+    def gather(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        free: wp.array(dtype=scalar),
+        energy: wp.array(dtype=wp.float64),
+        slope: wp.array(dtype=mat43),
+        lever: wp.array(dtype=mat43),
+        hessian: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=vec3),
+        diagonal_out: wp.array(dtype=mat33),
+        energy_out: wp.array(dtype=wp.float64),
+    ):
+        """Of each vertex: the force, the block of the Hessian, and the energy of the pairs whose first free vertex it is."""
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        force = vec3()
+        d = mat33()
+        own = wp.float64(0.0)
+        for i in range(low, ends[v]):
+            k = entries[i] // 4
+            s = entries[i] % 4
+            force -= row(slope[k], s)
+            j = row(lever[k], s)
+            d += hessian[k] * wp.outer(j, j)
+            if free[v] > zero:
+                before = zero
+                for t in range(4):
+                    if t < s:
+                        before += free[quads[k][t]]
+                if before == zero:
+                    own += energy[k]
+        force_out[v] = force
+        diagonal_out[v] = d
+        energy_out[v] = own
+
+    @wp.kernel(module=module)
+    def stretch(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        lever: wp.array(dtype=mat43),
+        hessian: wp.array(dtype=scalar),
+        bend: wp.array(dtype=scalar),
+        first_bent: wp.array(dtype=mat43),
+        second_bent: wp.array(dtype=mat43),
+        project: wp.array(dtype=wp.int32),
+        response_out: wp.array(dtype=vec3),
+        across_out: wp.array(dtype=vec3),
+    ):
+        """Of each pair: what its three directions feel, N, and the part of a I."""
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                q = quads[k]
+                p0 = p[q[0]]
+                p1 = p[q[1]]
+                p2 = p[q[2]]
+                p3 = p[q[3]]
+                j = lever[k]
+                along = wp.dot(row(j, 0), p0) + wp.dot(row(j, 1), p1) + wp.dot(row(j, 2), p2) + wp.dot(row(j, 3), p3)
+                response = vec3(hessian[k] * along, zero, zero)
+                across = vec3()
+                if project[0] == 0 and bend[k] > zero:
+                    c = bend[k]
+                    a = weights[k]
+                    u = a[0] * p0 + a[1] * p1 + a[2] * p2 + a[3] * p3
+                    across = -c * (u - wp.dot(normals[k], u) * normals[k])
+                    g = first_bent[k]
+                    response[1] = c * (
+                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+                    )
+                    g = second_bent[k]
+                    response[2] = c * (
+                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+                    )
+                response_out[k] = response
+                across_out[k] = across
+
+    @wp.kernel(module=module)
+    def spread(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        lever: wp.array(dtype=mat43),
+        first_bent: wp.array(dtype=mat43),
+        second_bent: wp.array(dtype=mat43),
+        project: wp.array(dtype=wp.int32),
+        response: wp.array(dtype=vec3),
+        across: wp.array(dtype=vec3),
+        y: wp.array(dtype=vec3),
+    ):
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        if ends[v] > low:
+            total = vec3()
+            for i in range(low, ends[v]):
+                k = entries[i] // 4
+                s = entries[i] % 4
+                total += response[k][0] * row(lever[k], s)
+                if project[0] == 0:
+                    total += weights[k][s] * across[k]
+                    total += response[k][1] * row(first_bent[k], s) + response[k][2] * row(second_bent[k], s)
+            y[v] = y[v] + total
+
+    return SimpleNamespace(differentiate=differentiate, gather=gather, stretch=stretch, spread=spread, mat43=mat43, row=row)
+
+
+class BarrierTerm(ActivePairs):
+    """The barriers at the positions that were last frozen: a term of the potential.
+
+    project: (1,) int32 on the device, whether the Hessian is positive semidefinite; set from outside.
+    force_of_vertex: (n,) vec3, N; diagonal: (n,) 3x3 blocks, N/m; energy_of_vertex: (n,) float64, J: what `differentiate` fills.
+    """
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        n = len(self.kappa)
+        self.exact = kernels(self.real)
+        self.project = wp.ones(1, dtype=wp.int32, device=self.device.warp)
+        self.force_of_vertex = wp.zeros(n, dtype=self.real.vec3, device=self.device.warp)
+        self.energy_of_vertex = wp.zeros(n, dtype=wp.float64, device=self.device.warp)
+
+    def _allocate(self, capacity: int) -> None:
+        super()._allocate(capacity)
+        device, real = self.device.warp, self.real
+        mat43 = kernels(real).mat43
+        self.slope, self.lever = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
+        self.energy_of_pair = wp.zeros(capacity, dtype=wp.float64, device=device)
+        self.bend = wp.zeros(capacity, dtype=real.scalar, device=device)
+        self.first_bent, self.second_bent = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
+        self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
+
+    def differentiate(self, x: wp.array) -> None:
+        """Launches energy, force and Hessian at the frozen positions x."""
+        k, device = self.exact, self.device
+        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness]
+        result = [self.energy_of_pair, self.slope, self.lever, self.hessian]
+        bent = [self.bend, self.first_bent, self.second_bent]
+        device.launch_list(k.differentiate, self.capacity, [self.count, x, *frozen, *result, *bent])
+        inputs = [self.ends, self.entries, self.quads, self.free, *result]
+        device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+
+    def forces(self, x: wp.array) -> wp.array:
+        """(n,) vec3, N: what the frozen pairs exert at x on each vertex."""
+        self.differentiate(x)
+        return self.force_of_vertex
+
+    def apply(self, p: wp.array, y: wp.array) -> None:
+        """y += (contact Hessian) p, pair by pair and gathered per vertex. Recordable."""
+        k, device = self.exact, self.device
+        bent = [self.first_bent, self.second_bent, self.project]
+        inputs = [self.count, p, self.quads, self.weights, self.normals, self.lever, self.hessian, self.bend, *bent]
+        device.launch_list(k.stretch, self.capacity, [*inputs, self.felt, self.across])
+        inputs = [self.ends, self.entries, self.weights, self.lever, *bent, self.felt, self.across]
+        device.launch(k.spread, len(self.ends), [*inputs, y])
+
+    def couple(self, modes) -> None:
+        """Adds the Hessian to the matrix of the rigid modes. Recordable."""
+        inputs = [self.ends, self.entries, self.quads, self.lever, self.hessian]
+        self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+
+
+@functools.cache
+def coupling(real: Real) -> wp.Kernel:
+    """The kernel that adds rank-one terms of pairs to the matrix of rigid modes, a group of vertices a worker."""
+    from pdipc.linear import rigid_modes
+
+    scalar, vec3 = real.scalar, real.vec3
+    f, k_of = rigid_modes.functions(real), kernels(real)
+    row, mat43, _vec6 = k_of.row, k_of.mat43, f.vec6
+
+    @wp.kernel(module=real.module(f"{__name__}.coupling"))
+    def couple(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.int32),
+        groups: int,
+        arms: wp.array(dtype=vec3),
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        lever: wp.array(dtype=mat43),
+        hessian: wp.array(dtype=scalar),
+        c: wp.array(dtype=wp.float64),
+    ):
+        g = first + wp.tid()
+        size = rigid_modes.MODES * groups
+        for m in range(starts[g], starts[g + 1]):
+            v = members[m]
+            begin = int(0)
+            if v > 0:
+                begin = ends[v - 1]
+            for e in range(begin, ends[v]):
+                k = entries[e] // 4
+                s = entries[e] % 4
+                h = wp.float64(hessian[k])
+                own = f.mode(arms[v], row(lever[k], s))
+                for t in range(4):
+                    i = quads[k][t]
+                    other = label[i]
+                    if other >= 0 and other <= g:
+                        far = f.mode(arms[i], row(lever[k], t))
+                        if other >= low[g]:
+                            f.add_outer(c, size, g, other, h, own, far)
+                    # a partner outside of the profile, on either side, is bounded by the diagonals
+                    if other >= 0 and (other < low[g] or g < low[wp.max(other, 0)]):
+                        f.add_outer(c, size, g, g, h, own, own)
+
+    return couple  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)

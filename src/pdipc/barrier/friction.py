@@ -1,0 +1,302 @@
+"""Coulomb friction with a lagged normal force (Li et al. 2020, Section 5): a term of the potential.
+
+    D = sum mu lambda f0(|u|),   u = (I - n n^T) sum_i a_i u_i,   f0' = f1,   f1 = 2 y - y^2 for y = |u| / (eps_v h) < 1, else 1
+
+u_i is the displacement of a vertex since the start of the step. lambda, a and n are those of the barrier at the positions that were last copied.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.barrier import potential as barrier
+from pdipc.barrier.exact import BarrierTerm
+from pdipc.device.launch import Span
+from pdipc.device.precision import Real
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    module = real.module(__name__)
+    bar = barrier.functions(real)
+    zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
+
+    @wp.kernel(module=module)
+    def copy(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        stiffness: wp.array(dtype=scalar),
+        coefficient: wp.array(dtype=scalar),
+        entries: wp.array(dtype=wp.int32),
+        quads_out: wp.array(dtype=wp.vec4i),
+        weights_out: wp.array(dtype=vec4),
+        normals_out: wp.array(dtype=vec3),
+        limit_out: wp.array(dtype=scalar),
+        entries_out: wp.array(dtype=wp.int32),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                quads_out[k] = quads[k]
+                weights_out[k] = weights[k]
+                normals_out[k] = normals[k]
+                limit_out[k] = -coefficient[k] * stiffness[k] * bar.barrier_gradient(gaps[k], activation[k])
+                for s in range(4):
+                    entries_out[4 * k + s] = entries[4 * k + s]
+
+    @wp.kernel(module=module)
+    def copy_ends(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        count_out: wp.array(dtype=wp.int32),
+        ends_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        ends_out[i] = ends[i]
+        if i == 0:
+            count_out[0] = count[0]
+
+    @wp.func
+    def slip(q: wp.vec4i, a: vec4, n: vec3, u: wp.array(dtype=vec3)) -> vec3:
+        s = a[0] * u[q[0]] + a[1] * u[q[1]] + a[2] * u[q[2]] + a[3] * u[q[3]]
+        return s - wp.dot(n, s) * n
+
+    @wp.kernel(module=module)
+    def evaluate(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        u: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        limit: wp.array(dtype=scalar),
+        threshold: scalar,
+        project: wp.array(dtype=wp.int32),
+        energy_out: wp.array(dtype=wp.float64),
+        force_out: wp.array(dtype=vec3),
+        block_out: wp.array(dtype=mat33),
+    ):
+        """Energy, J; the force per unit of witness weight, N; and the block of the Hessian, N/m."""
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                n = normals[k]
+                s = slip(quads[k], weights[k], n, u)
+                size = wp.length(s)
+                rate = limit[k] * bar.smoothed_coulomb(size, threshold)
+                y = size / threshold
+                length = size
+                along = zero
+                if y < one:
+                    length = threshold * (y * y - y * y * y / scalar(3.0) + one / scalar(3.0))
+                    along = limit[k] * (two - two * y) / threshold
+                energy_out[k] = wp.float64(limit[k]) * wp.float64(length)
+                force_out[k] = -rate * s
+                h = rate * (mat33(wp.identity(n=3, dtype=scalar)) - wp.outer(n, n))
+                # across the slip f1 / |u|, along it f1': nearly none once it slides, and Newton's step overshoots the kink at rest.
+                # f1 / |u| in all directions bounds D from above, so that it descends.
+                if size > zero and project[0] == 0:
+                    t = s / size
+                    h += (along - rate) * wp.outer(t, t)
+                block_out[k] = h
+
+    @wp.kernel(module=module)
+    def gather(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        free: wp.array(dtype=scalar),
+        energy: wp.array(dtype=wp.float64),
+        force: wp.array(dtype=vec3),
+        block: wp.array(dtype=mat33),
+        force_out: wp.array(dtype=vec3),
+        diagonal_out: wp.array(dtype=mat33),
+        energy_out: wp.array(dtype=wp.float64),
+    ):
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        total = vec3()
+        d = mat33()
+        own = wp.float64(0.0)
+        for i in range(low, ends[v]):
+            k = entries[i] // 4
+            s = entries[i] % 4
+            a = weights[k][s]
+            total += a * force[k]
+            d += (a * a) * block[k]
+            if free[v] > zero:
+                before = zero
+                for t in range(4):
+                    if t < s:
+                        before += free[quads[k][t]]
+                if before == zero:
+                    own += energy[k]
+        force_out[v] = total
+        diagonal_out[v] = d
+        energy_out[v] = own
+
+    @wp.kernel(module=module)
+    def stretch(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        block: wp.array(dtype=mat33),
+        response_out: wp.array(dtype=vec3),
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                q = quads[k]
+                a = weights[k]
+                response_out[k] = block[k] * (a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]])
+
+    @wp.kernel(module=module)
+    def spread(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        response: wp.array(dtype=vec3),
+        y: wp.array(dtype=vec3),
+    ):
+        v = first + wp.tid()
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        if ends[v] > low:
+            total = vec3()
+            for i in range(low, ends[v]):
+                k = entries[i] // 4
+                total += weights[k][entries[i] % 4] * response[k]
+            y[v] = y[v] + total
+
+    return SimpleNamespace(copy=copy, copy_ends=copy_ends, evaluate=evaluate, gather=gather, stretch=stretch, spread=spread)
+
+
+class FrictionTerm:
+    """force_of_vertex, diagonal, energy_of_vertex: as for `BarrierTerm`. threshold: eps_v h, m."""
+
+    def __init__(self, barrier_term: BarrierTerm, threshold: float):
+        self.source, self.device, self.real = barrier_term, barrier_term.device, barrier_term.real
+        self.threshold, self.kernels = self.real.scalar(threshold), kernels(self.real)
+        n, device = len(barrier_term.kappa), self.device.warp
+        self.count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.ends = wp.zeros(n, dtype=wp.int32, device=device)
+        self.diagonal = wp.zeros(n, dtype=self.real.mat33, device=device)
+        self.force_of_vertex = wp.zeros(n, dtype=self.real.vec3, device=device)
+        self.energy_of_vertex = wp.zeros(n, dtype=wp.float64, device=device)
+        self.capacity = 0
+        self.grow()
+
+    def grow(self) -> None:
+        """As much room as the barrier has."""
+        capacity = self.source.capacity
+        if capacity == self.capacity:
+            return
+        real = self.real
+
+        def make(dtype, count=capacity):
+            return wp.zeros(count, dtype=dtype, device=self.device.warp)
+
+        self.capacity = capacity
+        self.quads, self.weights, self.normals, self.limit = make(wp.vec4i), make(real.vec4), make(real.vec3), make(real.scalar)
+        self.entries = make(wp.int32, 4 * capacity)
+        self.energy_of_pair, self.force, self.block = make(wp.float64), make(real.vec3), make(real.mat33)
+        self.response = make(real.vec3)
+
+    def lag(self) -> None:
+        """Launches the copy of the barrier's pairs, with the normal forces that they have now."""
+        k, device, s = self.kernels, self.device, self.source
+        device.launch(k.copy_ends, len(self.ends), [s.count, s.ends, self.count, self.ends])
+        inputs = [s.count, s.quads, s.weights, s.normals, s.gaps, s.activation, s.stiffness, s.coefficient, s.entries]
+        device.launch_list(k.copy, self.capacity, [*inputs, self.quads, self.weights, self.normals, self.limit, self.entries])
+
+    def differentiate(self, u: wp.array, project: wp.array) -> None:
+        """Launches energy, force and Hessian at the displacements u since the start of the step; project: (1,) int32, whether the Hessian
+        is to be a bound that never overshoots.
+        """
+        k, device = self.kernels, self.device
+        inputs = [self.count, u, self.quads, self.weights, self.normals, self.limit, self.threshold, project]
+        result = [self.energy_of_pair, self.force, self.block]
+        device.launch_list(k.evaluate, self.capacity, [*inputs, *result])
+        inputs = [self.ends, self.entries, self.quads, self.weights, self.source.free, *result]
+        device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+
+    def apply(self, p: wp.array, y: wp.array) -> None:
+        """y += (friction Hessian) p. Recordable."""
+        k, device = self.kernels, self.device
+        device.launch_list(k.stretch, self.capacity, [self.count, p, self.quads, self.weights, self.block, self.response])
+        device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
+
+    def couple(self, modes) -> None:
+        """Adds the Hessian to the matrix of the rigid modes. Recordable."""
+        inputs = [self.ends, self.entries, self.quads, self.weights, self.block]
+        self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+
+
+@functools.cache
+def coupling(real: Real) -> wp.Kernel:
+    """As in `exact`, for terms of rank two."""
+    from pdipc.linear import rigid_modes
+
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    f = rigid_modes.functions(real)
+
+    @wp.kernel(module=real.module(f"{__name__}.coupling"))
+    def couple(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        low: wp.array(dtype=wp.int32),
+        groups: int,
+        arms: wp.array(dtype=vec3),
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        block: wp.array(dtype=mat33),
+        c: wp.array(dtype=wp.float64),
+    ):
+        g = first + wp.tid()
+        size = rigid_modes.MODES * groups
+        one = wp.float64(1.0)
+        for m in range(starts[g], starts[g + 1]):
+            v = members[m]
+            begin = int(0)
+            if v > 0:
+                begin = ends[v - 1]
+            for e in range(begin, ends[v]):
+                k = entries[e] // 4
+                a = weights[k][entries[e] % 4]
+                b = block[k]
+                for t in range(4):
+                    i = quads[k][t]
+                    other = label[i]
+                    outside = other >= 0 and (other < low[g] or g < low[wp.max(other, 0)])
+                    for axis in range(3):
+                        # block = sum over axes of its column times the unit vector
+                        unit = vec3()
+                        unit[axis] = scalar(1.0)
+                        column = vec3(b[0, axis], b[1, axis], b[2, axis])
+                        own = f.mode(arms[v], a * column)
+                        if other >= low[g] and other <= g:
+                            f.add_outer(c, size, g, other, one, own, f.mode(arms[i], weights[k][t] * unit))
+                        if outside:
+                            f.add_outer(c, size, g, g, one, own, f.mode(arms[v], a * unit))
+
+    return couple  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)

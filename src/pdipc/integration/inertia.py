@@ -1,0 +1,150 @@
+"""Implicit Euler around the solve: lines 1, 2 and 18 of Algorithm 1, the clock and the report of a step."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.device import system
+from pdipc.device.precision import Real
+from pdipc.nonlinear import status
+
+# What a step reports after its counts, in one array that the host reads once: iterations, numbers, gap, then the stages' times.
+LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, FIRST_NUMBER = (wp.constant(status.COUNTS + place) for place in range(5))
+TIMES = wp.constant(status.COUNTS + 4 + status.NUMBERS)
+SIZE = status.COUNTS + 4 + status.NUMBERS + len(status.STAGES)
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def compare(
+        first: int,
+        x_start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        foreign_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a step starts anywhere but where the last one ended."""
+        i = first + wp.tid()
+        for axis in range(3):
+            if x_start[i][axis] != x[i][axis]:
+                foreign_out[0] = 1
+
+    @wp.kernel(module=module)
+    def predict(
+        first: int,
+        x: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        a: wp.array(dtype=vec3),
+        acceleration: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        h: scalar,
+        u_out: wp.array(dtype=vec3),
+        z_out: wp.array(dtype=vec3),
+        u_tilde_out: wp.array(dtype=vec3),
+    ):
+        """Lines 1 and 2 as displacements: z - x* = h v* + h^2 M^-1 f_ext, x~ - x* = h v* + h^2/4 a*. Kinematic vertices: their target.
+
+        rest: what rounding took off the position x* when it was stored.
+        """
+        i = first + wp.tid()
+        u_out[i] = rest[i]
+        if free[i] > scalar(0.0):
+            inertial = rest[i] + h * v[i]
+            z_out[i] = inertial + h * h * acceleration[i]
+            u_tilde_out[i] = inertial + scalar(0.25) * h * h * a[i]
+        else:
+            z_out[i] = target[i] - x[i]
+            u_tilde_out[i] = target[i] - x[i]
+
+    @wp.kernel(module=module)
+    def begin(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        local_global: wp.array(dtype=wp.int32),
+        linear: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        for i in range(status.COUNTS):
+            count[i] = 0
+        for i in range(status.NUMBERS):
+            numbers[i] = scalar(0.0)
+        local_global[0] = 0
+        linear[0] = 0
+        going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def finish(
+        first: int,
+        x_start: wp.array(dtype=vec3),
+        rest_start: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_velocity: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        h: scalar,
+        v: wp.array(dtype=vec3),
+        a: wp.array(dtype=vec3),
+        rest_out: wp.array(dtype=vec3),
+        v_out: wp.array(dtype=vec3),
+        a_out: wp.array(dtype=vec3),
+    ):
+        """Line 18: v = (x - x*) / h, a = (v - v*) / h; and what rounding took off x."""
+        i = first + wp.tid()
+        velocity = (u_velocity[i] - rest_start[i]) / h
+        a_out[i] = (velocity - v[i]) / h
+        v_out[i] = velocity
+        left = (x_start[i] - x[i]) + u[i]
+        if free[i] == scalar(0.0):
+            left = vec3()
+        rest_out[i] = left
+
+    @wp.kernel(module=module)
+    def report(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        local_global: wp.array(dtype=wp.int32),
+        linear: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
+        closest: wp.array(dtype=scalar),
+        foreign: wp.array(dtype=wp.int32),
+        clock: wp.array(dtype=wp.float64),
+        report_out: wp.array(dtype=wp.float64),
+    ):
+        for i in range(status.COUNTS):
+            report_out[i] = wp.float64(count[i])
+        report_out[LOCAL_GLOBAL] = wp.float64(local_global[0])
+        report_out[LINEAR] = wp.float64(linear[0])
+        report_out[FOREIGN] = wp.float64(foreign[0])
+        report_out[GAP] = wp.float64(wp.inf)
+        if count[status.BARRIERS] > 0:
+            report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))
+        for i in range(status.NUMBERS):
+            report_out[FIRST_NUMBER + i] = wp.float64(numbers[i])
+        for stage in range(status.STARTED):
+            report_out[TIMES + stage] = clock[stage]
+
+    milliseconds = system.milliseconds()  # the step is one graph, so its stages are timed where it runs
+
+    @wp.kernel(module=module)
+    def start_clock(first: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
+        for i in range(clock.shape[0]):
+            clock[i] = wp.float64(0.0)
+        now = milliseconds(call, argument)
+        clock[status.STARTED] = now
+        clock[status.LAST] = now
+
+    @wp.kernel(module=module)
+    def mark(first: int, stage: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
+        """The time since the last mark belongs to `stage`."""
+        now = milliseconds(call, argument)
+        clock[stage] = clock[stage] + now - clock[status.LAST]
+        clock[status.LAST] = now
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})

@@ -1,0 +1,310 @@
+"""Conjugate gradients on the Newton matrix: assembled blocks and contacts, preconditioned by the block diagonal and rigid modes.
+
+The form is that of `pcg` (Chronopoulos and Gear 1989). A solve ends when sqrt(r . M^-1 r), which is about the energy norm of the error, has
+fallen to a part of the first one, or to what a tolerated motion of one vertex costs.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
+from pdipc.linear import kernels as shared
+from pdipc.linear import pcg
+from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.rigid_modes import RigidModes
+
+
+LOOSE = 10.0  # how much less exact a solve is that is far from the end
+
+
+class Coupling(Protocol):
+    """What contact adds to the matrix, low-rank terms pair by pair."""
+
+    diagonal: wp.array  # (n,) 3x3 blocks of the diagonal, kg/s^2
+
+    def apply(self, p: wp.array, y: wp.array) -> None:
+        """Launches y += (contact Hessian) p."""
+        ...
+
+    def couple(self, modes: RigidModes) -> None:
+        """Launches what the Hessian adds to the matrix of the rigid modes."""
+        ...
+
+
+class BlockPcg:
+    """Solves K p = b on the free vertices by launches alone.
+
+    tolerance: relative, of sqrt(r . M^-1 r). most: iterations of a solve. iterations: (1,) int32 on the device, done since it was last set to
+    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, and ended there.
+    """
+
+    def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, tolerance: float, most: int):
+        n, scalar = matrix.count, real.scalar
+        self.device, self.real, self.matrix = device, real, matrix
+        self.modes = RigidModes(device, real, matrix, free)
+        self.tolerance, self.most = tolerance, most
+        self.sums = shared.Sums(device, n)
+
+        def zeros(dtype, count: int = n + 1) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device.warp)
+
+        self._r, self._u, self._w, self._p, self._s = (zeros(real.vec3) for _ in range(5))
+        self._inverse = zeros(real.mat33)
+        self._free = wp.array(free.astype(np.int32), device=device.warp)
+        self._numbers, self._partial = zeros(scalar, 3), zeros(scalar, self.sums.slots)
+        self._first, self._residual = zeros(scalar, 1), zeros(scalar, 1)
+        self.iterations, self._left, self._going = zeros(wp.int32, 1), zeros(wp.int32, 1), zeros(wp.int32, 1)
+        self.indefinite = zeros(wp.int32, 1)
+        self._steps = wp.zeros((most, 2), dtype=scalar, device=device.warp)
+        self._kernels, self._pcg = kernels(real), pcg.kernels(real)
+        self._advance = _advance_kernel(real)
+
+    def prepare(self, x: wp.array, contacts: list[Coupling]) -> None:
+        """Launches the preconditioner for the matrix and contacts as they are now, at the positions x."""
+        k = self._kernels
+        diagonals = [c.diagonal for c in contacts] + [None] * (2 - len(contacts))
+        inputs = [self._free, self.matrix.diagonal, *diagonals, self._inverse]
+        self.device.launch(k.invert_diagonal, self.matrix.count, inputs, grain=32)
+        if self.modes.groups:
+            self.modes.prepare(x, contacts)
+
+    def solve(self, p: wp.array, b: wp.array, contacts: list[Coupling], tolerated: float, loose: wp.array) -> None:
+        """Launches the solution of K p = b. p: (n,) vec3, m; the start on entry, the solution on return; entries that are not free stay.
+
+        tolerated: N^(1/2) m^(1/2), the norm below which a residual is as good as none. loose: (1,) int32 on the device, whether LOOSE times the
+        tolerance will do.
+        """
+        k, sums, m = self._kernels, self.sums, self.matrix
+        rows = [m.offsets, m.columns, m.values, m.held]
+        status = [self._first, self._left, self.iterations, self._residual, self._going]
+        limits = [loose, self.real.scalar(self.tolerance), self.most]
+        self.device.launch(k.clear, m.count, [self._w])
+        for c in contacts:
+            c.apply(p, self._w)
+        self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
+        self._precondition()
+        sums.conclude(
+            k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite]
+        )
+
+        def iterate() -> None:
+            for c in contacts:
+                c.apply(self._u, self._w)
+            sums.launch(k.multiply, [*rows, self._free, self._u, self._w, self._partial])
+            sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])
+            sums.launch(self._advance, [self._numbers, 1, self._w, self._u, self._p, self._s, p, self._r])
+            self._precondition()
+            sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits[1:], *status])
+
+        self.device.loop(self._going, iterate)
+
+    def clear(self, values: wp.array) -> None:
+        """Launches values = 0 over the vertices."""
+        self.device.launch(self._kernels.clear, self.matrix.count, [values])
+
+    def _precondition(self) -> None:
+        modes = self.modes
+        if modes.groups:
+            modes.restrict(self._r)
+        inputs = [self._inverse, modes.label, modes.arms, modes.z, self._r, self._u, self._partial]
+        self.sums.launch(self._kernels.correct, inputs)
+
+
+def _advance_kernel(real: Real) -> wp.Kernel:
+    from pdipc.linear import coarse
+
+    return coarse.kernels(real).advance
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    module = real.module(__name__)
+    f = shared.functions(real)
+    vec6 = wp.types.vector(6, wp.float64)
+
+    @wp.func
+    def product(
+        i: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        held: wp.array(dtype=scalar),
+        p: wp.array(dtype=vec3),
+    ) -> vec3:
+        own = p[i]
+        total = held[i] * own
+        for e in range(offsets[i], offsets[i + 1]):
+            total += values[e] * (p[columns[e]] - own)
+        return total
+
+    @wp.kernel(module=module)
+    def clear(first: int, values_out: wp.array(dtype=vec3)):
+        values_out[first + wp.tid()] = vec3()
+
+    @wp.kernel(module=module)
+    def invert_diagonal(
+        first: int,
+        free: wp.array(dtype=wp.int32),
+        elastic: wp.array(dtype=mat33),
+        contact_a: wp.array(dtype=mat33),
+        contact_b: wp.array(dtype=mat33),
+        inverse_out: wp.array(dtype=mat33),
+    ):
+        i = first + wp.tid()
+        if free[i] == 1:
+            total = elastic[i]
+            if contact_a:
+                total += contact_a[i]
+            if contact_b:
+                total += contact_b[i]
+            inverse_out[i] = f.invert(total)
+
+    @wp.kernel(module=module)
+    def start(
+        first: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        held: wp.array(dtype=scalar),
+        free: wp.array(dtype=wp.int32),
+        b: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        w: wp.array(dtype=vec3),
+        r_out: wp.array(dtype=vec3),
+        s_out: wp.array(dtype=vec3),
+        p_out: wp.array(dtype=vec3),
+    ):
+        """r = b - K x; w holds the contacts' part of K x and is left zero."""
+        i = first + wp.tid()
+        r_out[i] = vec3()
+        if free[i] == 1:
+            r_out[i] = b[i] - product(i, offsets, columns, values, held, x) - w[i]
+        w[i] = vec3()
+        s_out[i] = vec3()
+        p_out[i] = vec3()
+
+    @wp.kernel(module=module)
+    def begin(
+        first: int,
+        partial: wp.array(dtype=scalar),
+        slots: int,
+        numbers: wp.array(dtype=scalar),
+        tolerated: scalar,
+        loose: wp.array(dtype=wp.int32),
+        tolerance: scalar,
+        most: int,
+        first_out: wp.array(dtype=scalar),
+        left_out: wp.array(dtype=wp.int32),
+        iterations: wp.array(dtype=wp.int32),
+        residual_out: wp.array(dtype=scalar),
+        going_out: wp.array(dtype=wp.int32),
+        indefinite_out: wp.array(dtype=wp.int32),
+    ):
+        lane = first + wp.tid()
+        gamma = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            numbers[pcg.ALPHA] = scalar(1.0)
+            numbers[pcg.BETA] = scalar(0.0)
+            numbers[pcg.GAMMA] = gamma
+            norm = wp.sqrt(gamma)
+            reference = norm
+            if loose[0] != 0:
+                reference = scalar(LOOSE) * norm
+            reference = wp.max(reference, tolerated / tolerance)
+            first_out[0] = reference
+            left_out[0] = most
+            residual_out[0] = norm / reference
+            indefinite_out[0] = 0
+            going_out[0] = 0
+            if norm > tolerance * reference or not wp.isfinite(gamma):
+                going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def find_alpha(
+        first: int,
+        partial: wp.array(dtype=scalar),
+        slots: int,
+        numbers: wp.array(dtype=scalar),
+        left: wp.array(dtype=wp.int32),
+        indefinite_out: wp.array(dtype=wp.int32),
+    ):
+        """alpha; where the curvature along the direction is negative, no step, the end, and a note of it."""
+        lane = first + wp.tid()
+        delta = f.sum_partials(partial, slots, lane)
+        if lane == 0:
+            gamma = numbers[pcg.GAMMA]
+            curvature = delta - numbers[pcg.BETA] * gamma / numbers[pcg.ALPHA]
+            if curvature > scalar(0.0) or wp.isnan(curvature):
+                numbers[pcg.ALPHA] = gamma / curvature
+            else:
+                numbers[pcg.ALPHA] = scalar(0.0)
+                left[0] = 1
+                indefinite_out[0] = 1
+
+    @wp.kernel(module=module)
+    def multiply(
+        first: int,
+        share: int,
+        count: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        held: wp.array(dtype=scalar),
+        free: wp.array(dtype=wp.int32),
+        u: wp.array(dtype=vec3),
+        w: wp.array(dtype=vec3),
+        partial_out: wp.array(dtype=scalar),
+    ):
+        """w = K u, where w holds the contacts' part already, and delta = u . w."""
+        worker = first + wp.tid()
+        delta = scalar(0.0)
+        for i in range(worker * share, wp.min((worker + 1) * share, count)):
+            total = vec3()
+            if free[i] == 1:
+                total = product(i, offsets, columns, values, held, u) + w[i]
+            w[i] = total
+            delta += wp.dot(u[i], total)
+        f.store_sum(delta, worker, partial_out)
+
+    @wp.kernel(module=module)
+    def correct(
+        first: int,
+        share: int,
+        count: int,
+        inverse: wp.array(dtype=mat33),
+        label: wp.array(dtype=wp.int32),
+        arms: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec6),
+        r: wp.array(dtype=vec3),
+        u_out: wp.array(dtype=vec3),
+        partial_out: wp.array(dtype=scalar),
+    ):
+        """u = D^-1 r + Z z, gamma = r . u."""
+        worker = first + wp.tid()
+        gamma = scalar(0.0)
+        for i in range(worker * share, wp.min((worker + 1) * share, count)):
+            g = label[i]
+            if g >= 0:
+                m = z[g]
+                residual = r[i]
+                turn = vec3(scalar(m[3]), scalar(m[4]), scalar(m[5]))
+                u = inverse[i] * residual + vec3(scalar(m[0]), scalar(m[1]), scalar(m[2])) + wp.cross(turn, arms[i])
+                u_out[i] = u
+                gamma += wp.dot(residual, u)
+        f.store_sum(gamma, worker, partial_out)
+
+    return SimpleNamespace(
+        clear=clear,
+        invert_diagonal=invert_diagonal,
+        start=start,
+        begin=begin,
+        find_alpha=find_alpha,
+        multiply=multiply,
+        correct=correct,
+    )

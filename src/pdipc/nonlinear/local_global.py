@@ -1,0 +1,251 @@
+"""The local-global iterations of projective dynamics inside Algorithm 1 (lines 6 to 12), accelerated."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from pdipc.barrier.pairs import ActivePairs
+from pdipc.barrier.restitution import Restitution
+from pdipc.device.launch import Reducer
+from pdipc.device.precision import Real
+from pdipc.linear import Translations
+from pdipc.nonlinear import status
+from pdipc.nonlinear.anderson import Anderson
+
+INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the tolerance
+REBOUND_ITERATIONS, REBOUND_TOLERANCE = 200, 1e-5  # of the iterations for restitution: most, and relative motion
+INNER_TOLERANCE = 0.2  # or by less than this part of its first iteration
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def inertia(
+        first: int,
+        u_tilde: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec3),
+        mass: wp.array(dtype=scalar),
+        free: wp.array(dtype=scalar),
+        h: scalar,
+        damping: scalar,
+        force_out: wp.array(dtype=vec3),
+        increment_out: wp.array(dtype=vec3),
+    ):
+        """-dE/dx at x~ (line 8), with mass-proportional damping; and a zero start for the increment."""
+        i = first + wp.tid()
+        scale = free[i] * mass[i] / h
+        force_out[i] = scale / h * (z[i] - u_tilde[i]) - scale * damping * (u_tilde[i] - rest[i])
+        increment_out[i] = vec3()
+
+    @wp.kernel(module=module)
+    def measure(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        x_tilde_out: wp.array(dtype=vec3),
+        moved_out: wp.array(dtype=scalar),
+    ):
+        """How far each free vertex wants to go; where that is no number, infinitely far, and it stays."""
+        i = first + wp.tid()
+        moved = wp.length(u_tilde[i] - u[i])
+        if not (moved < scalar(1.0e30)):
+            moved = scalar(wp.inf)
+            u_tilde[i] = u[i]
+        x_tilde_out[i] = base[i] + u_tilde[i]
+        if free[i] == scalar(0.0) and moved < scalar(wp.inf):
+            moved = scalar(0.0)
+        moved_out[i] = moved
+
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        passes: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        increment: wp.array(dtype=scalar),
+        clock: wp.array(dtype=wp.float64),
+        tolerance: scalar,
+        max_outer: int,
+        budget_ms: wp.float64,
+        numbers: wp.array(dtype=scalar),
+        count: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """Line 16, at the untruncated motion: the truncated one becomes small because t_I does, converged or not.
+
+        Iterations converge linearly: with the ratio r of the last two motions the error that is left is about r / (1 - r) of the last.
+        """
+        code = int(status.RUNNING)
+        residual = numbers[status.MOVED]
+        waits = count[status.BEHIND] > 0 and count[status.OUTER] % 2 == 1  # see commit
+        # the first motion says nothing of how fast they shrink
+        ratio = scalar(0.99)
+        if count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        numbers[status.MOVED_BEFORE] = residual
+        count[status.BEHIND] = 0
+        if overflow[0] != 0:
+            code = status.OVERFLOW
+        elif residual >= scalar(wp.inf):
+            code = status.NOT_FINITE
+            count[status.OUTER] = count[status.OUTER] + 1
+        else:
+            count[status.OUTER] = count[status.OUTER] + 1
+            count[status.BARRIERS] = pairs[0]
+            if passes[0] > 0:
+                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
+            settled = passes[0] == 0 and not waits and left <= tolerance
+            if settled:
+                code = status.CONVERGED
+            elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+                code = status.OUT_OF_TIME
+            elif count[status.OUTER] >= max_outer:
+                code = status.CAPPED
+        count[status.STATUS] = code
+        going_out[0] = 0
+        if code == status.RUNNING:
+            going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def commit(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        base: wp.array(dtype=vec3),
+        u_end: wp.array(dtype=vec3),
+        x_end: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        u_out: wp.array(dtype=vec3),
+        x_out: wp.array(dtype=vec3),
+        u_tilde_out: wp.array(dtype=vec3),
+        lag_out: wp.array(dtype=scalar),
+    ):
+        """The truncated motion is made. Scripted vertices that it left behind their target go on to it in every second outer
+        iteration: in the one between, the others make way, so that gaps do not shrink from iteration to iteration.
+        """
+        i = first + wp.tid()
+        lag_out[i] = scalar(0.0)
+        if count[status.STATUS] != status.OVERFLOW and count[status.STATUS] != status.NOT_FINITE:
+            x_out[i] = x_end[i]
+            u_out[i] = u_end[i]
+            u_tilde_out[i] = u_end[i]
+            left = (target[i] - base[i]) - u_end[i]
+            if free[i] == scalar(0.0) and wp.length_sq(left) > scalar(0.0):
+                count[status.BEHIND] = 1
+                lag_out[i] = wp.length(left)
+                if count[status.OUTER] % 2 == 0:
+                    u_tilde_out[i] = u_end[i] + left
+
+    return SimpleNamespace(inertia=inertia, measure=measure, decide=decide, commit=commit)
+
+
+class LocalGlobal:
+    """See `nonlinear.Method`."""
+
+    def __init__(self, work):
+        model = work.model
+        device, real, n = model.device, model.real, model.vertex_count
+        self.work, self.model, self.device, self.kernels = work, model, device, kernels(real)
+
+        def zeros(dtype, count=n):
+            return wp.zeros(count, dtype=dtype, device=device.warp)
+
+        self.force, self.rhs, self.increment = zeros(real.vec3), zeros(real.vec3), zeros(real.vec3)
+        self.moved, self.lags = zeros(real.scalar), zeros(real.scalar)
+        self.numbers = zeros(real.scalar, status.NUMBERS)
+        self.largest = Reducer(device, real, n)
+        self.iterations = model.solver.iterations
+        self._make()
+        self.inner = self.loop.done
+
+    def _make(self) -> None:
+        """The pairs, the inner loop, and where solves start."""
+        model, settings = self.model, self.model.settings
+        surfaces = (model.device, model.real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        self.pairs = ActivePairs(*surfaces)
+        ends = INNER_FRACTION * settings.tolerance, INNER_TOLERANCE
+        self.loop = Anderson(model.device, model.real, model.vertex_count, *ends)
+        self.parting = Anderson(model.device, model.real, model.vertex_count, 0.0, REBOUND_TOLERANCE)
+        self.translations = None if model.solver.moves_bodies else Translations(model.solver.system)
+
+    @property
+    def generation(self) -> int:
+        """Grows whenever arrays were replaced."""
+        return self.pairs.generation
+
+    def grow(self) -> bool:
+        """Makes room where a list was full."""
+        return self.pairs.grow()
+
+    def start(self) -> None:
+        """Nothing is known of the motion yet but the predictor."""
+        self.pairs.expect(self.work.u, self.work.u_tilde)
+
+    def freeze(self) -> None:
+        """Line 5."""
+        self.pairs.freeze(self.work.candidates, self.work.x)
+
+    def solve(self) -> None:
+        """Lines 6 to 12."""
+        w, k, n = self.work, self.kernels, self.model.vertex_count
+        self.loop.begin(self.model.settings.inner_iterations)
+        self.device.loop(self.loop.going, self._local_global)
+        self.device.launch(k.measure, n, [w.x_start, w.u, w.u_tilde, self.model.free, w.x_tilde, self.moved])
+        self.largest.max(self.moved, self.numbers, status.MOVED)
+
+    def _local_global(self) -> None:
+        """Lines 8 to 11: local projections and the global step, at fixed barriers."""
+        w, model, device, k, s = self.work, self.model, self.device, self.kernels, self.model.settings
+        h, damping = model.real.scalar(s.time_step), model.real.scalar(s.damping)
+        inputs = [w.u_tilde, w.rest, w.z, model.mass, model.free, h, damping, self.force, self.increment]
+        device.launch(k.inertia, model.vertex_count, inputs)
+        model.projector.add_forces(w.x_start, w.u_tilde, self.rhs, self.force)
+        self.pairs.linearize(w.u, w.u_tilde, w.rest, self.rhs)
+        self.solve_linear(self.increment, self.rhs)
+        self.loop.advance(w.u_tilde, self.increment, model.free)
+
+    def solve_linear(self, increment: wp.array, rhs: wp.array) -> None:
+        """Line 10: K increment = rhs."""
+        if self.translations is not None:
+            self.translations.start(increment, rhs, self.pairs)
+        self.model.solver.solve(increment, rhs, self.pairs)
+
+    def correct(self, r: Restitution) -> None:
+        """The velocities of restitution: `r.u_now`."""
+        w, model = self.work, self.model
+        model.projector.add_forces(w.x_start, w.u, r.elastic, r.zero)
+        parting = self.parting
+        parting.begin(REBOUND_ITERATIONS)
+
+        def local_global() -> None:
+            r.inertia(w.u, self.force, self.increment)
+            model.projector.add_forces(w.x_start, r.u_now, self.rhs, self.force)
+            r.linearize(w.rest, self.rhs)
+            self.solve_linear(self.increment, self.rhs)
+            parting.advance(r.u_now, self.increment, model.free)
+
+        self.device.loop(parting.going, local_global)
+
+    def accept(self) -> None:
+        """Line 16."""
+        w, k = self.work, self.kernels
+        self.pairs.expect(w.u, w.u_tilde, w.truncation.fraction)
+        self._decide(k.decide, [])
+        t = w.truncation
+        motion = [w.x_start, t.u_end, t.x_end, w.target, self.model.free, w.u, w.x, w.u_tilde, self.lags]
+        self.device.launch(k.commit, self.model.vertex_count, [w.count, *motion])
+        self.largest.max(self.lags, self.numbers, status.LAG)
+
+    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
+        w, s = self.work, self.model.settings
+        states = [self.pairs.count, w.truncation.passes, w.candidates.overflow, self.loop.moved, w.clock]
+        limits = [self.model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
+        self.device.launch_serial(kernel, [*states, *limits, *extra, self.numbers, w.count, w.going])

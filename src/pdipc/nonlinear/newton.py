@@ -1,0 +1,698 @@
+"""Projected Newton inside Algorithm 1: one step of Newton's method an outer iteration, and none that raises the potential.
+
+The potential of a step is that of Section 3, with the barrier and lagged friction,
+
+    Phi(x) = E + Psi + B + D,     E = sum m |u - z|^2 / (2 h^2) + damping,
+
+over the displacements u since the start of the step. Its Hessian is made positive semidefinite element by element and pair by pair, and
+conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free nonlinear programming ... could fit in Alg. 1").
+
+After truncation Phi is compared, island by island. Where it rose, the island goes back along the same direction: first all of it to the least
+fraction that truncation left to one of its vertices, then by halves. What CCD has not proven is proven anew. So every outer iteration descends,
+unless a script moves something that the island may touch: then the potential itself has changed.
+
+Newton's own step is the estimate of the error, since it is what one more iteration would change: the step has converged when no free
+vertex would go further than the tolerance, was neither truncated nor turned back, and all that is scripted has arrived. Scripted vertices
+that were truncated go on in later iterations, as long as no pair of theirs is squeezed; else they wait, and the result says how far behind they are.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.barrier.exact import BarrierTerm
+from pdipc.barrier.friction import FrictionTerm
+from pdipc.barrier.restitution import Restitution
+from pdipc.collision.islands import Islands
+from pdipc.device.launch import Reducer
+from pdipc.device.precision import Real
+from pdipc.linear.block_pcg import BlockPcg
+from pdipc.linear.blocks import BlockMatrix
+from pdipc.nonlinear import status
+from pdipc.nonlinear.sums import BodySums
+
+FRICTION_LAGS = (
+    12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
+)
+HALVINGS = 30  # of an island's step, then it stays where it is
+SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
+DRIVES = 24  # outer iterations in which scripted vertices go on to their targets, at most
+STALLS = 3  # outer iterations without any progress of some island, then the step ends
+SLACK = {
+    "float32": 4.0e-7,
+    "float64": 1.0e-12,
+}  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
+KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
+PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
+PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+    wide = wp.float64
+    slack = wp.constant(wp.float64(SLACK[real.name]))
+
+    @wp.func
+    def wide_square(a: vec3, b: vec3) -> wide:
+        total = wide(0.0)
+        for k in range(3):
+            d = wide(a[k]) - wide(b[k])
+            total += d * d
+        return total
+
+    @wp.kernel(module=module)
+    def inertia(
+        first: int,
+        u: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec3),
+        mass: wp.array(dtype=scalar),
+        free: wp.array(dtype=scalar),
+        h: scalar,
+        damping: scalar,
+        force_out: wp.array(dtype=vec3),
+        energy_out: wp.array(dtype=wide),
+    ):
+        """-dE/du and E of each vertex (line 8), with mass-proportional damping."""
+        i = first + wp.tid()
+        scale = free[i] * mass[i] / h
+        force_out[i] = scale / h * (z[i] - u[i]) - scale * damping * (u[i] - rest[i])
+        energy = wide(scale) / wide(h) * wide_square(u[i], z[i]) + wide(scale) * wide(damping) * wide_square(u[i], rest[i])
+        energy_out[i] = wide(0.5) * energy
+
+    @wp.kernel(module=module)
+    def add(first: int, a: wp.array(dtype=wide), b: wp.array(dtype=wide), sum_out: wp.array(dtype=wide)):
+        i = first + wp.tid()
+        sum_out[i] = a[i] + b[i]
+
+    @wp.kernel(module=module)
+    def begin(
+        first: int,
+        u: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        drive: wp.array(dtype=wp.int32),
+        barrier: wp.array(dtype=vec3),
+        friction: wp.array(dtype=vec3),
+        rhs: wp.array(dtype=vec3),
+        p_out: wp.array(dtype=vec3),
+    ):
+        """The whole force; and where the step starts from: scripted vertices go to their targets where they are driven."""
+        i = first + wp.tid()
+        total = rhs[i] + barrier[i]
+        if friction:
+            total += friction[i]
+        rhs[i] = free[i] * total
+        p_out[i] = vec3()
+        if free[i] == scalar(0.0) and drive[0] != 0:
+            p_out[i] = (target[i] - base[i]) - u[i]
+
+    @wp.kernel(module=module)
+    def propose(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        rhs: wp.array(dtype=vec3),
+        inertial: wp.array(dtype=vec3),
+        u_tilde_out: wp.array(dtype=vec3),
+        x_tilde_out: wp.array(dtype=vec3),
+        moved_out: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=scalar),
+        scale_out: wp.array(dtype=scalar),
+    ):
+        """x~ = x + p; how far each free vertex wants to go, and the forces on it. What is no number stays, infinitely far from its goal."""
+        i = first + wp.tid()
+        step = p[i]
+        moved = wp.length(step)
+        if not (moved < scalar(1.0e30)):
+            moved = scalar(wp.inf)
+            step = vec3()
+        u_tilde_out[i] = u[i] + step
+        x_tilde_out[i] = base[i] + (u[i] + step)
+        moved_out[i] = moved
+        if free[i] == scalar(0.0) and moved < scalar(wp.inf):
+            moved_out[i] = scalar(0.0)
+        force_out[i] = wp.length(rhs[i])
+        scale_out[i] = wp.length(inertial[i])
+
+    @wp.kernel(module=module)
+    def judge(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        driven: wp.array(dtype=wp.int32),
+        deep: wp.array(dtype=wp.int32),
+        base_old: wp.array(dtype=wide),
+        friction_old: wp.array(dtype=wide),
+        base_new: wp.array(dtype=wide),
+        friction_new: wp.array(dtype=wide),
+        overflow: wp.array(dtype=wp.int32),
+        negligible: wide,
+        before: wp.array(dtype=wide),
+        after: wp.array(dtype=wide),
+        squeezed: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        accepted_out: wp.array(dtype=wp.int32),
+        searching_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether the potential of each island has not risen. before, after, squeezed: (bodies,)
+        scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
+        for b in range(bodies):
+            before[b] = wide(0.0)
+            after[b] = wide(0.0)
+            accepted_out[b] = 0
+            squeezed[b] = 0
+        for b in range(bodies):
+            if deep[b] != 0:
+                squeezed[label[b]] = 1
+            before[label[b]] = before[label[b]] + base_old[b] + friction_old[b]
+            after[label[b]] = after[label[b]] + base_new[b] + friction_new[b]
+            if driven[b] != 0:
+                accepted_out[label[b]] = 1
+        searching = int(0)
+        for b in range(bodies):
+            island = label[b]
+            ok = accepted_out[island]
+            if after[island] <= before[island] + slack * wp.abs(before[island]) + negligible or attempts[0] > HALVINGS:
+                ok = 1
+            if squeezed[island] != 0 and attempts[0] == 0:
+                ok = 0
+            accepted_out[b] = ok
+            if ok == 0:
+                searching = 1
+        attempts[0] = attempts[0] + 1
+        if overflow[0] != 0:
+            searching = 0
+        searching_out[0] = searching
+
+    @wp.kernel(module=module)
+    def least_fraction(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        free: wp.array(dtype=scalar),
+        fraction: wp.array(dtype=scalar),
+        least_out: wp.array(dtype=scalar),
+    ):
+        b = first + wp.tid()
+        least = scalar(1.0)
+        for i in range(starts[b], ends[b]):
+            if free[i] > scalar(0.0):
+                least = wp.min(least, fraction[i])
+        least_out[b] = least
+
+    @wp.kernel(module=module)
+    def spread_least(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        island_least_out: wp.array(dtype=scalar),
+    ):
+        for b in range(bodies):
+            island_least_out[b] = scalar(1.0)
+        for b in range(bodies):
+            island_least_out[label[b]] = wp.min(island_least_out[label[b]], least[b])
+
+    @wp.kernel(module=module)
+    def turn_back(
+        first: int,
+        body: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
+        x_end_out: wp.array(dtype=vec3),
+        passes_out: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        if i == 0:
+            passes_out[0] = 1  # what is not shortened has been proven already
+            going_out[0] = 1
+        b = body[i]
+        if b >= 0 and accepted[wp.max(b, 0)] == 0:
+            f = scalar(0.5) * fraction[i]
+            shortest = least[label[b]]
+            if attempts[0] == 1 and shortest < scalar(1.0):
+                f = shortest
+            if attempts[0] >= HALVINGS:
+                f = scalar(0.0)
+            fraction[i] = f
+            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i])
+            x_end_out[i] = base[i] + u_end_out[i]
+
+    @wp.kernel(module=module)
+    def commit(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        base: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        u_end: wp.array(dtype=vec3),
+        x_end: wp.array(dtype=vec3),
+        u_out: wp.array(dtype=vec3),
+        x_out: wp.array(dtype=vec3),
+        lag_out: wp.array(dtype=scalar),
+    ):
+        """The motion is made. lag: how far a scripted vertex is from its target, m."""
+        i = first + wp.tid()
+        lag_out[i] = scalar(0.0)
+        if overflow[0] == 0:
+            u_out[i] = u_end[i]
+            x_out[i] = x_end[i]
+            if free[i] == scalar(0.0):
+                lag_out[i] = wp.length((target[i] - base[i]) - u_end[i])
+
+    @wp.kernel(module=module)
+    def commit_energies(
+        first: int,
+        base_new: wp.array(dtype=wide),
+        base_old_out: wp.array(dtype=wide),
+    ):
+        b = first + wp.tid()
+        base_old_out[b] = base_new[b]
+
+    @wp.kernel(module=module)
+    def crowd(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        free: wp.array(dtype=scalar),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        u: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        crowded_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a pair of a scripted vertex that is behind its target is squeezed."""
+        k = first + wp.tid()
+        if k < pairs[0] and gaps[k] < scalar(SQUEEZED) * activation[k]:
+            for s in range(4):
+                i = quads[k][s]
+                if free[i] == scalar(0.0) and wp.length((target[i] - base[i]) - u[i]) > scalar(0.0):
+                    crowded_out[0] = 1
+
+    @wp.kernel(module=module)
+    def clear_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
+        flag_out[0] = 0
+
+    @wp.kernel(module=module)
+    def set_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
+        flag_out[0] = 1
+
+    @wp.kernel(module=module)
+    def choose(
+        first: int,
+        hits: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
+        tolerance: scalar,
+        project_out: wp.array(dtype=wp.int32),
+        renew_out: wp.array(dtype=wp.int32),
+    ):
+        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads. Elastic
+        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last.
+        """
+        project_out[0] = 1
+        renew = int(1)
+        if count[status.OUTER] > 0 and hits[0] == 0 and attempts[0] == 1:
+            project_out[0] = 0
+            if renew_out[0] == 1 and numbers[status.MOVED] <= scalar(KEEP) * tolerance:
+                renew = int(0)
+        renew_out[0] = renew
+
+    @wp.kernel(module=module)
+    def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
+        i = first + wp.tid()
+        if free[i] > scalar(0.0):
+            p[i] = vec3()
+
+    @wp.kernel(module=module)
+    def start(
+        first: int,
+        drive_out: wp.array(dtype=wp.int32),
+        lagging_out: wp.array(dtype=wp.int32),
+    ):
+        drive_out[0] = 1
+        lagging_out[0] = FRICTION_LAGS
+
+    @wp.kernel(module=module)
+    def before_search(
+        first: int,
+        passes: wp.array(dtype=wp.int32),
+        hits_out: wp.array(dtype=wp.int32),
+        attempts_out: wp.array(dtype=wp.int32),
+    ):
+        hits_out[0] = passes[0]
+        attempts_out[0] = 0
+
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        crowded: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        clock: wp.array(dtype=wide),
+        tolerance: scalar,
+        max_outer: int,
+        budget_ms: wide,
+        numbers: wp.array(dtype=scalar),
+        drive: wp.array(dtype=wp.int32),
+        lagging: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """Line 16. numbers: the largest wanted motion and lag, m."""
+        code = int(status.RUNNING)
+        residual = numbers[status.MOVED]
+        behind = numbers[status.LAG] > scalar(0.0)
+        driven = drive[0] != 0
+        # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes
+        ratio = scalar(0.0)
+        if count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        numbers[status.MOVED_BEFORE] = residual
+        if overflow[0] != 0:
+            code = status.OVERFLOW
+        else:
+            count[status.OUTER] = count[status.OUTER] + 1
+            count[status.BARRIERS] = pairs[0]
+            lagging[0] = lagging[0] - 1
+            if hits[0] > 0:
+                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
+            if attempts[0] > 1:
+                count[status.SEARCHES] = count[status.SEARCHES] + 1
+            if attempts[0] > HALVINGS:
+                count[status.STALLED] = count[status.STALLED] + 1
+            if driven:
+                count[status.DRIVEN] = count[status.DRIVEN] + 1
+            settled = left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
+            if residual >= scalar(wp.inf):
+                code = status.NOT_FINITE
+            elif settled and not behind:
+                code = status.CONVERGED
+            elif settled and (crowded[0] != 0 or count[status.DRIVEN] >= DRIVES) and not driven:
+                code = status.LAGGING
+            elif count[status.STALLED] >= STALLS:
+                code = status.STALLING
+            elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+                code = status.OUT_OF_TIME
+            elif count[status.OUTER] >= max_outer:
+                code = status.CAPPED
+        # scripted vertices go on in every second iteration: in the one between, the others make way
+        drive[0] = 0
+        if behind and not driven and crowded[0] == 0 and count[status.DRIVEN] < DRIVES:
+            drive[0] = 1
+        count[status.STATUS] = code
+        going_out[0] = 0
+        if code == status.RUNNING:
+            going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def note_motion(
+        first: int,
+        free: wp.array(dtype=scalar),
+        p: wp.array(dtype=vec3),
+        count: wp.array(dtype=wp.int32),
+    ):
+        """Whether anything scripted moves in this iteration; whoever writes, writes the same."""
+        i = first + wp.tid()
+        if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
+            count[status.MOVING] = 1
+
+    @wp.kernel(module=module)
+    def clear_motion(first: int, count: wp.array(dtype=wp.int32)):
+        count[status.MOVING] = 0
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+
+
+class Newton:
+    """The nonlinear solve of Algorithm 1 by projected Newton; see `nonlinear.protocol` for the seam.
+
+    numbers: on the device, see `status`: the largest motion that the last iteration wanted, m; forces, N; lag, m.
+    """
+
+    def __init__(self, work):
+        model = work.model
+        device, real, n = model.device, model.real, model.vertex_count
+        self.work, self.model, self.device, self.kernels = work, model, device, kernels(real)
+        assembly, settings = model.assembly, model.settings
+        surfaces = (device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        self.pairs = BarrierTerm(*surfaces)
+        self.friction = FrictionTerm(self.pairs, settings.slip_threshold) if model.has_friction else None
+        free = model.free_vertices
+        held = model.held
+        self.matrix = BlockMatrix(device, real, model.projector, held, free)
+        self.solver = BlockPcg(device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
+        work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
+        simulated = [body for body in assembly.bodies if not body.kinematic]
+        ranges = [(body.first, body.last) for body in simulated]
+        joined = np.array(
+            [(assembly.body_of_vertex[a.vertices_a[0]], assembly.body_of_vertex[a.vertices_b[0]]) for a in assembly.attachments]
+        ).reshape(-1, 2)
+        inside = assembly.body_of_vertex < len(simulated)
+        pinned = np.flatnonzero(inside & ~free)
+        self.islands = Islands(device, real, n, ranges, joined, pinned)
+        work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
+        work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
+        owner = np.where(inside, assembly.body_of_vertex, -1)
+        of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
+        elements = np.concatenate([*of_elements, np.zeros(0, dtype=owner.dtype)])
+        self.bodies = len(simulated)
+        self.base_sums = BodySums(device, [elements, owner], self.bodies)
+        self.friction_sums = BodySums(device, [owner], self.bodies)
+
+        def zeros(dtype, count=n):
+            return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
+
+        def upload(values) -> wp.array:
+            return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=device.warp)
+
+        self.starts, self.ends = upload([low for low, _ in ranges]), upload([high for _, high in ranges])
+        vec3, scalar = real.vec3, real.scalar
+        self.inertial, self.rhs, self.p = zeros(vec3), zeros(vec3), zeros(vec3, n + 1)
+        self.inertial_energy, self.vertex_energy = zeros(wp.float64), zeros(wp.float64)
+        self.moved, self.forces, self.scales, self.lags = (zeros(scalar) for _ in range(4))
+        self.numbers = zeros(scalar, status.NUMBERS)
+        self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
+        self.before, self.after = zeros(wp.float64, self.bodies), zeros(wp.float64, self.bodies)
+        self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
+        self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
+        (
+            self.attempts,
+            self.searching,
+            self.hits,
+            self.drive,
+            self.lagging,
+            self.crowded,
+            self.still,
+            self.project,
+            self.renew,
+        ) = (zeros(wp.int32, 1) for _ in range(9))
+        self.pairs.project = self.project
+        self.largest = Reducer(device, real, n)
+        lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
+        self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
+        self.iterations = self.solver.iterations
+        self.inner = zeros(wp.int32, 1)  # no local-global iterations
+
+    @property
+    def generation(self) -> int:
+        """Grows whenever arrays were replaced."""
+        return self.pairs.generation
+
+    def grow(self) -> bool:
+        """Makes room where a list was full."""
+        grown = self.pairs.grow()
+        if grown and self.friction is not None:
+            self.friction.grow()
+        return grown
+
+    def _contacts(self) -> list:
+        return [self.pairs] if self.friction is None else [self.pairs, self.friction]
+
+    # Algorithm 1, in launches only.
+
+    def start(self) -> None:
+        """Before the first outer iteration: the potential where the step starts."""
+        w = self.work
+        self.device.launch_serial(self.kernels.start, [self.drive, self.lagging])
+        self.islands.find(w.candidates)
+        if self.friction is not None:
+            self.pairs.freeze(w.candidates, w.x)
+            self.friction.lag()
+        self._evaluate(w.u, w.x)
+        self._keep_energies()
+
+    def _evaluate(self, u: wp.array, x: wp.array) -> None:
+        """The potential and the forces at x; with friction as it lags."""
+        w, k, device, n = self.work, self.kernels, self.device, self.model.vertex_count
+        s, real = self.model.settings, self.model.real
+        self.pairs.freeze(w.candidates, x)
+        self.pairs.differentiate(x)
+        inputs = [u, w.rest, w.z, self.model.mass, self.model.free, real.scalar(s.time_step), real.scalar(s.damping)]
+        device.launch(k.inertia, n, [*inputs, self.inertial, self.inertial_energy])
+        device.launch(k.add, n, [self.inertial_energy, self.pairs.energy_of_vertex, self.vertex_energy])
+        self.model.projector.evaluate(w.x_start, u)
+        self.base_sums.add([self.model.projector.energies, self.vertex_energy], self.base_new)
+        if self.friction is not None:
+            self.friction.differentiate(u, self.project)
+            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_new)
+
+    def _keep_energies(self) -> None:
+        if self.bodies:
+            self.device.launch(self.kernels.commit_energies, self.bodies, [self.base_new, self.base_old])
+
+    def freeze(self) -> None:
+        """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
+        w = self.work
+        self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
+        if self.friction is not None:
+            self.device.when(self._lags_now(), self.friction.lag)
+            self.friction.differentiate(w.u, self.project)
+            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
+
+    def _last(self) -> list:
+        """What is known of the last outer iteration."""
+        return [self.hits, self.attempts, self.work.count, self.numbers, self.model.real.scalar(self.model.settings.tolerance)]
+
+    def _lags_now(self) -> wp.array:
+        self.device.launch_serial(_positive(self.model.real), [self.lagging, self.searching])
+        return self.searching
+
+    def solve(self) -> None:
+        """Lines 6 to 12: x~ = x + p with K p = -grad Phi."""
+        w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
+        model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
+        friction = None if self.friction is None else self.friction.force_of_vertex
+        where = [w.u, w.x_start, w.target, model.free, self.drive]
+        device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        device.when(self.renew, self._assemble)
+        self._solve_linear()
+        device.when(self.solver.indefinite, self._solve_projected)
+        inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial]
+        device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
+        self.largest.max(self.moved, self.numbers, status.MOVED)
+        self.largest.max(self.forces, self.numbers, status.FORCE)
+        self.largest.max(self.scales, self.numbers, status.FORCE_SCALE)
+
+    def _assemble(self) -> None:
+        self.matrix.assemble(self.work.x_start, self.work.u, self.project)
+        self.solver.prepare(self.work.x, self._contacts())
+
+    def _solve_linear(self) -> None:
+        contacts = self._contacts()
+        self.solver.solve(self.p, self.rhs, contacts, self.tolerated, self.project)
+
+    def _solve_projected(self) -> None:
+        """Anew, with every element's Hessian positive semidefinite."""
+        w, k = self.work, self.kernels
+        self.device.launch_serial(k.set_flag, [self.project])
+        self.device.launch(k.restart, self.model.vertex_count, [self.model.free, self.p])
+        if self.friction is not None:
+            self.friction.differentiate(w.u, self.project)
+        self._assemble()
+        self._solve_linear()
+
+    def correct(self, r: Restitution) -> None:
+        """The velocities of restitution, `r.u_now`, by one step: the correction is small beside what bends an element."""
+        w, model, n = self.work, self.model, self.model.vertex_count
+        self.device.launch_serial(self.kernels.set_flag, [self.project])
+        self.matrix.assemble(w.x_start, w.u, self.project)
+        r.linearize_exact(w.rest)
+        self.device.launch(
+            self.kernels.begin,
+            n,
+            [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
+        )
+        self.solver.prepare(w.x, [self.pairs])
+        self.solver.solve(self.p, r.zero, [self.pairs], 0.0, self.still)
+        self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
+        self.solver.clear(r.zero)
+
+    def accept(self) -> None:
+        """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
+        w, k, device, n, model, t = (
+            self.work,
+            self.kernels,
+            self.device,
+            self.model.vertex_count,
+            self.model,
+            self.work.truncation,
+        )
+        device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts])
+        self.islands.find(w.candidates)
+        device.launch_serial(k.clear_motion, [w.count])
+        if model.scripted_vertices:
+            device.launch(k.note_motion, n, [model.free, self.p, w.count])
+            self.islands.find_driven(w.candidates, w.u, w.u_tilde)
+        self._evaluate(t.u_end, t.x_end)
+        energies = [
+            self.base_old,
+            self.friction_old,
+            self.base_new,
+            self.friction_new,
+            w.candidates.overflow,
+            self.tolerated**2,
+        ]
+        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.searching]
+        judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
+        device.launch_serial(k.judge, judging)
+
+        def search() -> None:
+            if self.bodies:
+                inputs = [self.starts, self.ends, model.free, t.first_fraction, self.least]
+                device.launch(k.least_fraction, self.bodies, inputs, grain=1000)
+                device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
+            which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
+            motion = [w.x_start, w.u, w.u_tilde, t.fraction, t.u_end, t.x_end, t.passes, t.going]
+            device.launch(k.turn_back, n, [*which, *motion])
+            w.candidates.check(w.x, t.x_end)
+            device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, t.x_end))
+            t.prove(w.candidates, w.x_start, w.u, w.u_tilde, w.x)
+            self._evaluate(t.u_end, t.x_end)
+            device.launch_serial(k.judge, judging)
+
+        device.loop(self.searching, search)
+        inputs = [w.count, w.candidates.overflow, w.x_start, w.target, model.free, t.u_end, t.x_end]
+        device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
+        self.largest.max(self.lags, self.numbers, status.LAG)
+        self._keep_energies()
+        device.launch_serial(k.clear_flag, [self.crowded])
+        if model.scripted_vertices:
+            p = self.pairs
+            inputs = [p.count, p.quads, model.free, p.gaps, p.activation, w.u, w.x_start, w.target]
+            device.launch(k.crowd, p.capacity, [*inputs, self.crowded])
+        s = model.settings
+        states = [self.pairs.count, self.hits, self.attempts, self.crowded, w.candidates.overflow, w.clock]
+        limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
+        device.launch_serial(k.decide, [*states, *limits, self.numbers, self.drive, self.lagging, w.count, w.going])
+
+
+@functools.cache
+def _positive(real: Real) -> wp.Kernel:
+    @wp.kernel(module=real.module(f"{__name__}.positive"))
+    def positive(first: int, number: wp.array(dtype=wp.int32), flag_out: wp.array(dtype=wp.int32)):
+        flag_out[0] = wp.where(number[0] > 0, 1, 0)
+
+    return positive  # pyright: ignore[reportReturnType]

@@ -1,0 +1,17 @@
+"""How a step stands: codes, and places in the arrays that the device keeps and the host reads once a step."""
+
+import warp as wp
+
+STAGES = ("solver", "ccd", "barrier", "misc")
+STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places of the clock, in milliseconds
+
+RUNNING, CONVERGED, LAGGING, CAPPED, OUT_OF_TIME, STALLING, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(8))
+
+# `count`, int32: of a step
+STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND, SEARCHES, STALLED, DRIVEN, MOVING = (wp.constant(place) for place in range(9))
+COUNTS = 9
+
+# `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
+# the largest force of inertia, to compare it with; how far something scripted is behind, m
+MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE = (wp.constant(place) for place in range(5))
+NUMBERS = 5

@@ -1,0 +1,88 @@
+"""Energies by body: sums of fixed blocks, so that they depend neither on threads nor on what other bodies do."""
+
+import functools
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.device.launch import Device
+
+BLOCK = 256  # numbers that one worker adds up
+
+
+@functools.cache
+def kernels() -> SimpleNamespace:
+    module = wp.get_module(__name__)
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module)
+    def add_blocks(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=wp.float64),
+        offset: int,
+        partial_out: wp.array(dtype=wp.float64),
+    ):
+        b = first + wp.tid()
+        total = wp.float64(0.0)
+        for i in range(starts[b], ends[b]):
+            total += values[i]
+        partial_out[offset + b] = total
+
+    @wp.kernel(module=module)
+    def add_bodies(
+        first: int,
+        offsets: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=wp.int32),
+        partial: wp.array(dtype=wp.float64),
+        total_out: wp.array(dtype=wp.float64),
+    ):
+        body = first + wp.tid()
+        total = wp.float64(0.0)
+        for k in range(offsets[body], offsets[body + 1]):
+            total += partial[blocks[k]]
+        total_out[body] = total
+
+    return SimpleNamespace(add_blocks=add_blocks, add_bodies=add_bodies)
+
+
+class BodySums:
+    """Adds up arrays whose entries belong to bodies. owners: for each array the body of every entry, -1 for none; bodies: how many."""
+
+    def __init__(self, device: Device, owners: list[np.ndarray], bodies: int):
+        self.device, self.bodies, self._kernels = device, bodies, kernels()
+        self._cuts: list[tuple[wp.array, wp.array, int, int]] = []
+        bodies_of_blocks = []
+        at = 0
+        for owner in owners:
+            owner = np.asarray(owner)
+            change = np.flatnonzero(np.diff(owner)) + 1
+            runs = np.concatenate([[0], change, [len(owner)]]).astype(np.int64)
+            starts = np.concatenate([np.arange(low, high, BLOCK) for low, high in itertools.pairwise(runs)] or [[]])
+            starts = starts.astype(np.int64)
+            ends = np.minimum(starts + BLOCK, runs[np.searchsorted(runs, starts, side="right").clip(max=len(runs) - 1)])
+            inside = owner[starts] >= 0 if len(starts) else np.zeros(0, dtype=bool)
+            starts, ends = starts[inside], ends[inside]
+            bodies_of_blocks.append(owner[starts] if len(starts) else np.zeros(0, dtype=np.int64))
+            self._cuts.append((self._upload(starts), self._upload(ends), at, len(starts)))
+            at += len(starts)
+        body = np.concatenate([*bodies_of_blocks, np.zeros(0, dtype=np.int64)])
+        order = np.argsort(body, kind="stable")
+        self._offsets = wp.array(np.searchsorted(body[order], np.arange(bodies + 1)).astype(np.int32), device=device.warp)
+        self._blocks = self._upload(order)
+        self._partial = wp.zeros(max(1, at), dtype=wp.float64, device=device.warp)
+
+    def _upload(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=self.device.warp)
+
+    def add(self, arrays: list[wp.array], total_out: wp.array) -> None:
+        """Launches total_out[b] = sum of the entries of body b over all arrays."""
+        for values, (starts, ends, at, count) in zip(arrays, self._cuts, strict=True):
+            if count:
+                inputs = [starts, ends, values, at, self._partial]
+                self.device.launch(self._kernels.add_blocks, count, inputs, grain=BLOCK // 4)
+        if self.bodies:
+            self.device.launch(self._kernels.add_bodies, self.bodies, [self._offsets, self._blocks, self._partial, total_out])

@@ -1,0 +1,97 @@
+"""Lines 5 to 12 and 16 of Algorithm 1 as printed: targets of Eq. (6), plain local-global iterations, and the paper's test."""
+
+import functools
+
+import warp as wp
+
+from pdipc.device.precision import Real
+from pdipc.nonlinear import status
+from pdipc.nonlinear.local_global import LocalGlobal
+from pdipc.paper_mode.energy_rate import EnergyRate
+from pdipc.paper_mode.targets import OUTER_SQUARED, PaperPairs
+
+
+@functools.cache
+def kernels(real: Real):
+    from types import SimpleNamespace
+
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+
+    @wp.kernel(module=module)
+    def measure_squared(first: int, u: wp.array(dtype=vec3), u_end: wp.array(dtype=vec3), moved_out: wp.array(dtype=scalar)):
+        i = first + wp.tid()
+        moved_out[i] = wp.length_sq(u_end[i] - u[i])
+
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        passes: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        increment: wp.array(dtype=scalar),
+        clock: wp.array(dtype=wp.float64),
+        tolerance: scalar,
+        max_outer: int,
+        budget_ms: wp.float64,
+        committed: wp.array(dtype=scalar),
+        numbers: wp.array(dtype=scalar),
+        count: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """Line 16 as printed: it looks at the truncated motion, which becomes small because t_I does, converged or not."""
+        code = int(status.RUNNING)
+        residual = numbers[status.MOVED]
+        waits = count[status.BEHIND] > 0 and count[status.OUTER] % 2 == 1
+        count[status.BEHIND] = 0
+        if overflow[0] != 0:
+            code = status.OVERFLOW
+        elif residual >= scalar(wp.inf):
+            code = status.NOT_FINITE
+            count[status.OUTER] = count[status.OUTER] + 1
+        else:
+            count[status.OUTER] = count[status.OUTER] + 1
+            count[status.BARRIERS] = pairs[0]
+            if passes[0] > 0:
+                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
+            numbers[status.MOVED] = wp.sqrt(committed[0])
+            if numbers[status.MOVED] <= wp.sqrt(scalar(OUTER_SQUARED)) and not waits:
+                code = status.CONVERGED
+            elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+                code = status.OUT_OF_TIME
+            elif count[status.OUTER] >= max_outer:
+                code = status.CAPPED
+        count[status.STATUS] = code
+        going_out[0] = 0
+        if code == status.RUNNING:
+            going_out[0] = 1
+
+    return SimpleNamespace(measure_squared=measure_squared, decide=decide)
+
+
+class Printed(LocalGlobal):
+    """See `nonlinear.Method`. The paper starts its solves from rest, and its diagonal changes with the barriers only (Section 5)."""
+
+    def _make(self) -> None:
+        model, settings, w = self.model, self.model.settings, self.work
+        surfaces = (model.device, model.real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        rebound = {"mass": model.mass, "restitution": settings.restitution or 0.0, "h": settings.time_step}
+        self.pairs = PaperPairs(*surfaces, **rebound)
+        self.loop = EnergyRate(model.device, model.real, model.projector, self.pairs, w.x_start, w.u, w.z, model.mass)
+        self.own = kernels(model.real)
+        self.committed = wp.zeros(1, dtype=model.real.scalar, device=model.device.warp)
+
+    def freeze(self) -> None:
+        """Line 5."""
+        super().freeze()
+        self.model.solver.prepare(self.pairs)
+
+    def solve_linear(self, increment: wp.array, rhs: wp.array) -> None:
+        """Line 10."""
+        self.model.solver.solve(increment, rhs, self.pairs, prepared=True)
+
+    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
+        w = self.work
+        self.device.launch(self.own.measure_squared, self.model.vertex_count, [w.u, w.truncation.u_end, self.moved])
+        self.largest.sum(self.moved, self.committed)
+        super()._decide(self.own.decide, [self.committed])

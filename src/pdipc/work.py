@@ -1,0 +1,163 @@
+"""The buffers of a step, allocated once for a model, and the recorded step."""
+
+import warnings
+from collections.abc import Callable
+
+import warp as wp
+
+from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
+from pdipc.collision.candidates import Candidates
+from pdipc.collision.truncation import Truncation
+from pdipc.device import system
+from pdipc.device.launch import Graph, one_at_a_time
+from pdipc.integration import inertia
+from pdipc.integration.loads import Loads
+from pdipc.model import Model, State
+from pdipc.nonlinear import Method, status
+from pdipc.nonlinear.local_global import LocalGlobal
+from pdipc.nonlinear.newton import Newton
+from pdipc.paper_mode.printed import Printed
+
+METHODS = {"newton": Newton, "local-global": LocalGlobal, "printed": Printed}
+
+
+class Work:
+    """What a step works with. Arrays over all n vertices, on the device:
+
+    x_start, rest, v_start, a_start: where the step starts, m, m/s, m/s^2; rest is what rounding took off x_start.
+    target: where kinematic vertices go, m. z: the inertial displacement of line 1, m.
+    u, x: the feasible iterate as displacement from x_start, with rest, and as position x = x_start + u, m. u_tilde, x_tilde: where the
+    outer iteration wants to go. v, a: the result.
+
+    count, going, clock: see `nonlinear.status`. method: how the step is solved. generation: changes when arrays were replaced.
+    recorded: whether steps run as recorded graphs; without, each kernel is launched from Python, with the same bits. So it
+    is for a solver that the host drives, and, with a warning, on a CUDA driver that has no loops in graphs.
+    """
+
+    @one_at_a_time
+    def __init__(self, model: Model, recorded: bool = True):
+        device, real, n = model.device, model.real, model.vertex_count
+        vec3, settings = real.vec3, model.settings
+        self.model, self.device, self.kernels = model, device, inertia.kernels(real)
+        self.recorded = recorded and model.recordable and device.records_loops
+        if recorded and not device.records_loops:
+            warnings.warn(f"the driver of {device.name} has no loops in graphs: each kernel is launched alone", stacklevel=2)
+
+        def zeros(dtype, count=n):
+            return wp.zeros(count, dtype=dtype, device=device.warp)
+
+        self.x_start, self.rest, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
+        self.x, self.v, self.a, self.rest_end = model.initial_state().positions, zeros(vec3), zeros(vec3), zeros(vec3)
+        self.u, self.u_tilde, self.x_tilde, self.z = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
+        self.target, self.loads = zeros(vec3), Loads(device, real, model.external)
+        self.count, self.going, self.foreign = zeros(wp.int32, status.COUNTS), zeros(wp.int32, 1), zeros(wp.int32, 1)
+        self.clock = zeros(wp.float64, len(status.STAGES) + 2)
+        self.report = zeros(wp.float64, inertia.SIZE)
+        self.h = real.scalar(settings.time_step)
+        self.candidates = Candidates(
+            device,
+            real,
+            model.surface,
+            model.broad_phase,
+            model.assembly.rest_positions,
+            model.half_separation,
+            settings.activation_distance,
+            settings.margin,
+        )
+        self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
+        self.method: Method = METHODS[settings.nonlinear_solver](self)
+        self.restitution = None
+        if settings.restitution is not None and settings.method == "barrier":
+            masses = (model.mass, model.free, model.body_mass, model.rigidity)
+            self.restitution = Restitution(device, real, self.method.pairs, *masses, settings.restitution, settings.time_step)
+        self._graphs: dict[str, Graph] = {}
+        self._graphs_of: tuple[int, int] = (-1, -1)
+        self._scripted = False
+
+    @property
+    def pairs(self):
+        """The barriers that were listed last."""
+        return self.method.pairs
+
+    def set_scripted(self, state: State, time: float) -> None:
+        """Where kinematic vertices go by `time`, only uploaded where they move, and the external accelerations."""
+        model = self.model
+        if not self._scripted or model.moves:
+            self.target.assign(model.kinematic_targets(time))
+            model.move_anchors(time)
+        self.loads.update(state.time, state.positions, state.velocities)
+        self._scripted = True
+
+    def run(self, part: Callable[["Work"], None]) -> None:
+        """Replays `part` of Algorithm 1; records it first where it is new or arrays were replaced."""
+        if not self.recorded:
+            part(self)
+            return
+        generation = (self.candidates.generation, self.method.generation)
+        if self._graphs_of != generation:
+            self._graphs, self._graphs_of = {}, generation
+        name = part.__name__
+        if name not in self._graphs:
+            self._graphs[name] = self.device.capture(lambda: part(self), self)
+        self._graphs[name].launch()
+
+    def grow(self) -> bool:
+        """Makes room where a list was full; returns whether one was."""
+        grown = [self.candidates.grow(), self.method.grow()]
+        self.candidates.overflow.zero_()
+        return any(grown)
+
+    def list_pairs(self, x: wp.array) -> None:
+        """Freezes the pairs that are active at x, outside of a step."""
+        while True:
+            self.candidates.cover(x, x)
+            self.pairs.freeze(self.candidates, x)
+            if not self.grow():
+                return
+
+    # What Algorithm 1 is made of, in launches only.
+
+    def start_clock(self) -> None:
+        """Times and counts of the step begin."""
+        device, k = self.device, self.kernels
+        device.launch_serial(k.start_clock, [*system.clock_call(), self.clock])
+        counts = [self.count, self.method.inner, self.method.iterations, self.method.numbers, self.going]
+        device.launch_serial(k.begin, counts)
+
+    def mark(self, stage: str) -> None:
+        """The time since the last mark belongs to `stage`."""
+        self.device.launch_serial(self.kernels.mark, [status.STAGES.index(stage), *system.clock_call(), self.clock])
+
+    def predict(self) -> None:
+        """Lines 1 and 2: z and x~, as displacements."""
+        self.device.copy(self.x, self.x_start)
+        start = [self.x_start, self.rest, self.v_start, self.a_start, self.loads.acceleration, self.target, self.model.free]
+        self.device.launch(self.kernels.predict, self.model.vertex_count, [*start, self.h, self.u, self.z, self.u_tilde])
+
+    def rebound(self) -> None:
+        """With restitution, velocities are those that bodies part with; the motion behind them is made in `restitution.u_now`."""
+        r = self.restitution
+        if r is None:
+            return
+        r.aim(self.rest, self.u, self.v_start)
+
+        def correct() -> None:
+            self.method.correct(r)
+            for u, place in ((self.rest, ELASTIC_START), (self.u, ELASTIC_END)):
+                self.model.projector.energy(self.x_start, u, r.sums, place)
+            r.limit(self.rest, self.u, self.v_start, self.loads.acceleration)
+
+        self.device.when(r.needed, correct)
+        self.mark("solver")
+
+    def part(self) -> None:
+        """Line 18."""
+        moved = self.u if self.restitution is None else self.restitution.u_now
+        inputs = [self.x_start, self.rest, self.u, moved, self.x, self.model.free, self.h, self.v_start, self.a_start]
+        self.device.launch(self.kernels.finish, self.model.vertex_count, [*inputs, self.rest_end, self.v, self.a])
+
+    def write_report(self) -> None:
+        """What the host reads when the step is over."""
+        m = self.method
+        numbers = [self.count, m.inner, m.iterations, m.numbers, m.pairs.closest, self.foreign, self.clock]
+        self.device.launch_serial(self.kernels.report, [*numbers, self.report])
