@@ -33,7 +33,7 @@ from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
-from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial
+from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial, uses_newton
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -42,9 +42,6 @@ DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": 
 
 
 TOLERANCE_SPEED, TOLERANCE_PART = 0.01, 1e-3  # the default: m/s, and the part of the smallest body's size
-LOCAL_GLOBAL_ONLY = {
-    "inner_iterations", "linear_solver", "linear_iterations", "linear_tolerance", "solver_order", "solver_drop"
-}  # fmt: skip
 
 
 @dataclass
@@ -307,9 +304,7 @@ def _nonlinear_solver(scene: Scene) -> str:
     sim = scene.simulation
     if scene.contact.method == "paper":
         return "printed"
-    if sim.nonlinear_solver != "auto":
-        return sim.nonlinear_solver
-    return "local-global" if sim.model_fields_set & LOCAL_GLOBAL_ONLY else "newton"
+    return "newton" if uses_newton(sim) else "local-global"
 
 
 def _tolerance(sim, assembly: Assembly) -> float:

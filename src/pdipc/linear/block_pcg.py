@@ -18,7 +18,6 @@ from pdipc.linear import pcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import RigidModes
 
-
 LOOSE = 10.0  # how much less exact a solve is that is far from the end
 
 

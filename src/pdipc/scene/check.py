@@ -14,7 +14,7 @@ from pdipc.scene import meshes
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.errors import SceneError
 from pdipc.scene.load import RightPart, load_right_part
-from pdipc.scene.schema import Scene
+from pdipc.scene.schema import LOCAL_GLOBAL_ONLY, Scene, uses_newton
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -73,6 +73,7 @@ def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[
         return findings, []
     precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
     complete = not (problems or part.problems)
+    fit_defaults(scene, assembly, precision)
     return findings + _check(assembly, precision, complete), assembly.notes
 
 
@@ -82,16 +83,44 @@ def _unreadable(problem: str) -> Finding:
 
 
 def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
-    """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`."""
+    """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`, whose defaults are fitted first."""
+    fit_defaults(scene, assembly, precision)
     findings = [*_settings(scene), *check(assembly, precision)]
     if findings:
         found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
         raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
 
 
+def fit_defaults(scene: Scene, assembly: Assembly, precision: str) -> None:
+    """Raises the minimum separations that the scene leaves open to what `precision` resolves, up to a tenth of the activation distance."""
+    least = smallest_separation(assembly, precision)
+    if scene.contact.minimum_separation or not assembly.minimum_separation < least <= 0.1 * assembly.activation_distance:
+        return
+    given = {placed.name for placed in (*scene.bodies, *scene.obstacles) if placed.minimum_separation}
+    for body in assembly.bodies:
+        if body.name not in given:
+            body.half_separation = max(body.half_separation, 0.5 * least)
+    assembly.minimum_separation = least
+
+
 def _settings(scene: Scene) -> Iterator[Finding]:
     """Settings of the solver that do not go together."""
     method, solver, drop = scene.contact.method, scene.simulation.linear_solver, scene.simulation.solver_drop
+    sim = scene.simulation
+    if sim.tolerance is not None and sim.outer_tolerance is not None:
+        yield Finding("simulation.outer_tolerance", "is given beside tolerance, and both say the same", "leave one of them out")
+    if sim.nonlinear_solver == "newton":
+        for name in sorted(sim.model_fields_set & LOCAL_GLOBAL_ONLY):
+            yield Finding(f"simulation.{name}", "has no effect with the Newton solver", 'leave it out, or take "local-global"')
+    if method == "paper" and sim.nonlinear_solver != "auto":
+        found = f'is "{sim.nonlinear_solver}", but the paper\'s contact has its own'
+        yield Finding("simulation.nonlinear_solver", found, "leave it out")
+    newton = method != "paper" and uses_newton(sim)
+    for body in scene.bodies:
+        model = getattr(body.material, "model", "auto")
+        if model in ("corotated", "neo_hookean") and not newton:
+            found = f'is "{model}", which no local projection belongs to'
+            yield Finding(f'body "{body.name}": material.model', found, 'take "arap", or the Newton solver')
     aggregates = solver == "a-jacobi" or (solver == "auto" and method == "paper")
     if aggregates and method == "barrier":
         found = f'"{solver}" cannot take the contacts of contact.method = "{method}"'

@@ -118,6 +118,19 @@ class Simulation(Table):
     )
 
 
+LOCAL_GLOBAL_ONLY = frozenset(
+    {"inner_iterations", "linear_solver", "linear_iterations", "linear_tolerance", "solver_order", "solver_drop"}
+)  # settings that choose local-global where nonlinear_solver is "auto"
+
+
+def uses_newton(simulation: Simulation) -> bool:
+    """Whether the barrier's contact is solved by Newton's method."""
+    if simulation.nonlinear_solver != "auto":
+        return simulation.nonlinear_solver == "newton"
+    chosen = {name for name in simulation.model_fields_set & LOCAL_GLOBAL_ONLY if getattr(simulation, name) != "auto"}
+    return not chosen
+
+
 class Contact(Table):
     """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
 
