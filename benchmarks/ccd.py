@@ -114,15 +114,15 @@ def record(scene_name: str, steps: int, output: Path) -> None:
     separations = []
     truncate = Truncation.truncate
 
-    def observed(self, candidates, x, x_tilde):
-        start_end = np.stack([x.numpy(), x_tilde.numpy()])
+    def observed(self, candidates, base, u, u_tilde, x):
+        start_end = np.stack([x.numpy(), base.numpy() + u_tilde.numpy()])
         for kind, queries_found in found.items():
             listed = getattr(candidates, kind)
             count = int(listed.count.numpy()[0])
             quads = listed.quads.numpy()[:count]
             queries_found.append(start_end[:, quads].transpose(1, 0, 2, 3).reshape(-1, 8, 3))
             separations.append(listed.limits.numpy()[:count, 0])
-        return truncate(self, candidates, x, x_tilde)
+        return truncate(self, candidates, base, u, u_tilde, x)
 
     Truncation.truncate = observed
     simulation.step()

@@ -193,10 +193,10 @@ def projections(place: Device, precision: str) -> dict[str, np.ndarray]:
         bent = rest @ np.array([[1.1, 0.2, 0.0], [-0.3, 0.9, 0.1], [0.0, 0.2, 1.2]]) + rng.normal(0.0, 5e-3, rest.shape)
         projector = Projector(place, number, len(rest), [constraints])
         at = wp.array(bent.astype(number.numpy), dtype=number.vec3, device=place.warp)
-        force, base = wp.zeros_like(at), wp.zeros_like(at)
+        force, still = wp.zeros_like(at), wp.zeros_like(at)
         energy = wp.zeros(1, dtype=number.scalar, device=place.warp)
-        projector.add_forces(at, force, base)
-        projector.energy(at, energy, 0)
+        projector.add_forces(at, still, force, still)
+        projector.energy(at, still, energy, 0)
         found |= {f"forces of {name}": force.numpy(), f"energy of {name}": energy.numpy()}
     return found
 
@@ -220,7 +220,11 @@ def contacts(place: Device, precision: str) -> dict[str, np.ndarray]:
         )
         while True:
             work.candidates.cover(x, x_end)
-            work.truncation.truncate(work.candidates, x, x_end)
+            still, motion = (
+                wp.zeros_like(x),
+                wp.array((squeezed - start).astype(model.real.numpy), dtype=model.real.vec3, device=place.warp),
+            )
+            work.truncation.truncate(work.candidates, x, still, motion, x)
             if not work.grow():
                 break
             work.candidates.invalidate()
@@ -230,9 +234,7 @@ def contacts(place: Device, precision: str) -> dict[str, np.ndarray]:
         found[f"truncated by {method}"] = work.truncation.x_end.numpy()
         work.list_pairs(work.truncation.x_end)
         found[f"barriers by {method}"] = work.pairs.count.numpy()[:1]
-        force = wp.zeros_like(x)
-        work.pairs.linearize(work.truncation.x_end, work.truncation.x_end, x, force)
-        found[f"barrier forces by {method}"] = force.numpy()
+        found[f"barrier forces by {method}"] = work.pairs.forces(work.truncation.x_end).numpy()
     return found
 
 
