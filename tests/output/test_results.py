@@ -349,7 +349,7 @@ open_ = open
 
 def test_what_cannot_be_written_for_another_reason_is_told_too(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="file/run cannot be written: Not a directory$"):
+    with pytest.raises(RunError, match=r"file/run cannot be written: Not a directory$"):
         runs.begin(tmp_path / "file/run")
 
 
