@@ -27,10 +27,11 @@ def truncated(motion, *, truncation="per_vertex", precision="float64", moving_fl
         model.rigid = [(b.first, b.last) for b in model.assembly.bodies if b.kinematic]
     work, x = Work(model), model.initial_state().positions
     start = x.numpy()
-    x_tilde = wp.array(start + motion(start, model), dtype=model.real.vec3, device="cpu")
+    wanted = wp.array(motion(start, model), dtype=model.real.vec3, device="cpu")
+    x_tilde = wp.array(start + wanted.numpy(), dtype=model.real.vec3, device="cpu")
     while True:
         work.candidates.cover(x, x_tilde)
-        work.truncation.truncate(work.candidates, x, x_tilde)
+        work.truncation.truncate(work.candidates, x, wp.zeros_like(x), wanted, x)
         if not work.grow():
             break
     return model, start, x_tilde.numpy(), work.truncation.x_end.numpy(), work.truncation.fraction.numpy()
