@@ -17,7 +17,7 @@ def falling(truncation="per_vertex", precision="float64"):
         solid("far", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 2.0, 0)),
         cloth("sheet", [0.3, 0.3], [6, 6], at=(0.02, 0.13, 0.01)),
     ]
-    return scene(bodies, [floor(2.0)], contact={"truncation": truncation}, precision=precision)
+    return scene(bodies, [floor(2.0)], contact={"truncation": truncation, "minimum_separation": 3e-5}, precision=precision)
 
 
 def truncated(motion, *, truncation="per_vertex", precision="float64", moving_floor=False):
