@@ -5,8 +5,16 @@ import pytest
 import warp as wp
 
 from pdipc import constraints
-from pdipc.constraints import corotated, curved_bending, edge_length, neo_hookean
-from pdipc.constraints import tet_strain, tet_volume, triangle_area, triangle_strain
+from pdipc.constraints import (
+    corotated,
+    curved_bending,
+    edge_length,
+    neo_hookean,
+    tet_strain,
+    tet_volume,
+    triangle_area,
+    triangle_strain,
+)
 from pdipc.device.launch import Device
 from pdipc.device.precision import real
 

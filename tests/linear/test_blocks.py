@@ -56,9 +56,7 @@ def elastic(model, matrix):
         if id(s) not in bending:
             for vertices, g, w in zip(s.vertices, s.gradient, s.weight, strict=True):
                 if corners > 1:  # attachments to points are held
-                    found[np.ix_(vertices, range(3), vertices, range(3))] += np.einsum(
-                        "ab,cd->acbd", w * g.T @ g, np.eye(3)
-                    )
+                    found[np.ix_(vertices, range(3), vertices, range(3))] += np.einsum("ab,cd->acbd", w * g.T @ g, np.eye(3))
             continue
         for vertices in s.vertices:
             for a in range(corners):
