@@ -20,7 +20,7 @@ def near_triangles(rng, turned):
         a = np.stack([0.3 * np.cos(angle), rng.uniform(-0.02, 0.0, 3), 0.3 * np.sin(angle)], axis=1)
         by = rng.uniform(0.3, 1.5) if turned is None else np.radians(turned * rng.uniform(0.3, 1.0))
         turn = np.array([[np.cos(by), 0, np.sin(by)], [0, 1, 0], [-np.sin(by), 0, np.cos(by)]])
-        low.append(a + [k, 0, 0])
+        low.append(a + np.array([k, 0, 0]))
         high.append(a @ turn.T * [1, 0.5, 1] + [k + rng.uniform(-0.01, 0.01), rng.uniform(0.02, 0.035), 0.01])
     bodies = [
         {"name": name, "kind": "cloth", "mesh": {"vertices": np.concatenate(x).tolist(), "triangles": faces.tolist()}}

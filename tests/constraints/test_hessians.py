@@ -1,5 +1,7 @@
 """Hessians of every kind that bends: against differences of forces as they are, and positive semidefinite where that is asked for."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -95,7 +97,7 @@ def blocks(projector, base, u, corners, project):
     projector.differentiate(upload(base), upload(u), wp.array([project], dtype=wp.int32, device="cpu"))
     values = projector.blocks.numpy().reshape(-1, corners * (corners + 1) // 2, 3, 3)
     found = np.zeros((len(values), corners, 3, corners, 3))
-    for k, (a, b) in enumerate((a, b) for a in range(corners) for b in range(a, corners)):
+    for k, (a, b) in enumerate(itertools.combinations_with_replacement(range(corners), 2)):
         found[:, b, :, a] = np.swapaxes(values[:, k], 1, 2)
         found[:, a, :, b] = values[:, k]
     return found.reshape(len(values), 3 * corners, 3 * corners)
