@@ -148,8 +148,8 @@ def crowded(go: list[str], resume: list[str], log: Path, seconds: float, chance:
 
 
 def limited(go: list[str], resume: list[str], log: Path, chance: random.Random) -> str:
-    """A limit on files ends the run with the project's message; without it, the run goes on."""
-    code = wait(start(go, log, largest_file=int(10 ** chance.uniform(2.0, 5.8))))
+    """A limit on files, the log of what it says among them, ends the run with the project's message; without it, the run goes on."""
+    code = wait(start(go, log, largest_file=int(10 ** chance.uniform(3.0, 5.8))))
     said = log.read_text()
     if (
         code not in (0, REFUSED)
