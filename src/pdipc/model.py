@@ -165,7 +165,11 @@ class Model:
         """The scene's start: time 0, with its initial velocities."""
         a = self.assembly
         zero = np.zeros_like(a.positions)
-        return self.state_from({"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "time": 0.0})
+        rounded = a.positions.astype(self.real.numpy).astype(np.float64)
+        # without what rounding takes off, steel in float32 would start under stress and then turn as if it were heavier
+        left = np.where(self.free_vertices[:, None], a.positions - rounded, 0.0)
+        start = {"positions": a.positions, "velocities": a.velocities, "accelerations": zero, "remainders": left, "time": 0.0}
+        return self.state_from(start)
 
     @one_at_a_time
     def state_from(self, arrays: dict[str, Any]) -> State:

@@ -192,7 +192,8 @@ def run_scene(
         writer = RunWriter.resume(out_dir)
     else:
         topology = {"triangles": model.triangles, **model.assembly.topology()}
-        meta = {**made_by, "threads": model.device.threads, "solver_dropped": model.solver.dropped}
+        dropped = 0.0 if model.solver is None else model.solver.dropped
+        meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
     with writer:
         _run(simulation, writer, steps, certify, progress)

@@ -17,7 +17,7 @@ def falling(truncation="per_vertex", precision="float64"):
         solid("far", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 2.0, 0)),
         cloth("sheet", [0.3, 0.3], [6, 6], at=(0.02, 0.13, 0.01)),
     ]
-    return scene(bodies, [floor(2.0)], contact={"truncation": truncation}, precision=precision)
+    return scene(bodies, [floor(2.0)], contact={"truncation": truncation, "minimum_separation": 3e-5}, precision=precision)
 
 
 def truncated(motion, *, truncation="per_vertex", precision="float64", moving_floor=False):
@@ -27,10 +27,11 @@ def truncated(motion, *, truncation="per_vertex", precision="float64", moving_fl
         model.rigid = [(b.first, b.last) for b in model.assembly.bodies if b.kinematic]
     work, x = Work(model), model.initial_state().positions
     start = x.numpy()
-    x_tilde = wp.array(start + motion(start, model), dtype=model.real.vec3, device="cpu")
+    wanted = wp.array(motion(start, model), dtype=model.real.vec3, device="cpu")
+    x_tilde = wp.array(start + wanted.numpy(), dtype=model.real.vec3, device="cpu")
     while True:
         work.candidates.cover(x, x_tilde)
-        work.truncation.truncate(work.candidates, x, x_tilde)
+        work.truncation.truncate(work.candidates, x, wp.zeros_like(x), wanted, x)
         if not work.grow():
             break
     return model, start, x_tilde.numpy(), work.truncation.x_end.numpy(), work.truncation.fraction.numpy()

@@ -78,6 +78,7 @@ def test_threads_meet(way, spins, monkeypatch):
         monkeypatch.setattr(system, "wait_call", lambda: system._address(ctypes.CDLL(None).sched_yield))
     monkeypatch.setattr(system, "SPINS", spins)
     count, times = 5, 2000
+    monkeypatch.setattr(system, "cores", lambda: count)
     meeting = wp.zeros(system.MEETING, dtype=wp.int32, device="cpu")
     launch = wp.launch(meet, dim=1, inputs=system.meet_inputs(meeting, count), device="cpu", record_cmd=True)
     done, apart = [0] * count, []

@@ -64,7 +64,7 @@ def groups(request, tmp_path, monkeypatch):
 @pytest.mark.parametrize("groups", QUOTAS, indirect=True)
 def test_quotas_of_containers(groups, monkeypatch):
     monkeypatch.delenv("PDIPC_THREADS", raising=False)
-    monkeypatch.setattr(threads, "_cores", lambda: 3)
+    monkeypatch.setattr(threads, "cores", lambda: 3)
     assert threads._quota(threads.GROUPS_OF_PROCESS, threads.CGROUPS) == groups
     assert threads.thread_count() == max(1, min(3, int(groups)))
 

@@ -347,6 +347,12 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch, place):
 open_ = open
 
 
+def test_what_cannot_be_written_for_another_reason_is_told_too(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"file/run cannot be written: Not a directory$"):
+        runs.begin(tmp_path / "file/run")
+
+
 # --- damage ---
 
 

@@ -132,7 +132,7 @@ class Device:
             wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
         else:
             bounds = [(dim * part) // self.threads for part in range(self.threads + 1)]
-            commands = [
+            commands: list[Any] = [
                 wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp, record_cmd=True)
                 for low, high in itertools.pairwise(bounds)
             ]
@@ -153,7 +153,7 @@ class Device:
             wp.launch(kernel, dim=1, inputs=[_span(0, 1, CPU_BLOCK), *inputs], device=self.warp)
         else:
             parts = self.threads
-            commands = [
+            commands: list[Any] = [
                 wp.launch(kernel, dim=1, inputs=[_span(part, parts, CPU_BLOCK), *inputs], device=self.warp, record_cmd=True)
                 for part in range(parts)
             ]

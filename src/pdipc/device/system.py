@@ -16,6 +16,8 @@ from typing import Any
 
 import warp as wp
 
+from pdipc.device.threads import cores
+
 # Threads meet after each kernel of a recorded graph. The last to arrive wakes the others. Those spin at first, since what they wait
 # for takes a microsecond as a rule. Where it takes longer, another process has a thread's core, two threads share one, or one has work
 # alone: they sleep (Linux) or give way (elsewhere). Who sleeps uses nothing of its share of the core and gets it at once when woken; who
@@ -150,8 +152,11 @@ def meet_kernel() -> wp.Kernel:
 
 
 def meet_inputs(meeting: wp.array, threads: int) -> list[Any]:
-    """What `meet_kernel` takes: (MEETING,) int32, zero before the first meeting, and how many threads meet."""
-    return [meeting, threads, SPINS, wait_call(), FUTEX]
+    """What `meet_kernel` takes: (MEETING,) int32, zero before the first meeting, and how many threads meet.
+
+    Where there are more of them than cores, spinning keeps from work those that are waited for.
+    """
+    return [meeting, threads, SPINS if threads <= cores() else SPINS >> 7, wait_call(), FUTEX]
 
 
 @functools.cache

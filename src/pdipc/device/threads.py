@@ -69,10 +69,11 @@ def thread_count() -> int:
             raise ValueError(f'PDIPC_THREADS is "{wanted}"; it must be a number of threads, 1 to 9999')
         return int(wanted)
     # one thread that has used up the container's time keeps all others waiting, so quotas are rounded down
-    return max(1, min(_cores(), int(_quota(GROUPS_OF_PROCESS, CGROUPS))))
+    return max(1, min(cores(), int(_quota(GROUPS_OF_PROCESS, CGROUPS))))
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Those that the process may use."""
     if hasattr(os, "process_cpu_count"):  # from Python 3.13 on
         return os.process_cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):  # Linux

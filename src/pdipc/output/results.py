@@ -14,6 +14,7 @@ Every file is written under a temporary name and then renamed; a frame counts on
 run.vtkhdf alone grows in place: it is derived from the frames and written anew where a kill damaged it, see `vtkhdf`.
 """
 
+import errno
 import json
 import math
 import numbers
@@ -35,6 +36,7 @@ from pdipc.output import lock
 FORMAT = 1
 NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", "frames", "checkpoints", "segments", lock.NAME}
 CHECKPOINTS_KEPT = 2
+NO_ROOM = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC), None}  # None: what NumPy says of a full disk
 UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
 
@@ -206,11 +208,10 @@ def _room(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        where = error.filename or folder
-        reason = error.strerror or str(error)
-        raise RunError(
-            f"{where} cannot be written: {reason}; what there is so far is kept: make room, then go on with --resume"
-        ) from error
+        said = f"{error.filename or folder} cannot be written: {error.strerror or error}"
+        if error.errno in NO_ROOM:
+            said += "; what there is so far is kept: make room, then go on with --resume"
+        raise RunError(said) from error
 
 
 class Run:

@@ -17,6 +17,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.linalg import cg
 
+from pdipc import constraints
+from pdipc.model import elasticity
 from pdipc.simulation import Simulation, stats_of
 from pdipc.viewer.guard import EVERYWHERE, Guard
 
@@ -169,10 +171,12 @@ class Grip:
         away = np.linalg.norm(x[choice] - x[vertex], axis=1)
         radius = max(GRIP * np.linalg.norm(np.ptp(x[own.first : own.last], axis=0)), np.sort(away)[:HELD][-1])
         vertices = choice[away <= radius]
-        mass = model.mass.numpy()[vertices].astype(np.float64)
+        mass, h = model.mass.numpy().astype(np.float64), model.settings.time_step
         shares = np.zeros(model.vertex_count)
-        shares[vertices] = mass / mass.sum()
-        matrix = scipy.sparse.csr_array(model.solver.system.matrix)[free][:, free]
+        shares[vertices] = mass[vertices] / mass[vertices].sum()
+        sets, _ = elasticity(model.assembly)  # the constant matrix of projective dynamics, whatever solves the step
+        inertia = scipy.sparse.diags_array(mass * (1.0 / (h * h) + model.settings.damping / h))
+        matrix = scipy.sparse.csr_array(constraints.stiffness_matrix(model.vertex_count, sets) + inertia)[free][:, free]
         preconditioner = scipy.sparse.diags_array(1.0 / matrix.diagonal())
         given_way, _ = cg(matrix, shares[free], rtol=1e-2, maxiter=200, M=preconditioner)  # a few per cent do no harm
         return Grip(int(vertex), vertices, shares[vertices], float(given_way @ shares[free]) * model.substeps**2)
