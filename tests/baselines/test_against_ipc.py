@@ -22,7 +22,7 @@ def falling_box(tolerance):
         "translation": (0, 0.125, 0),
         "rotation": (5, 3, 10),
         "velocity": (0.5, -1, 0),
-        "material": {"young_modulus": 1e5, "poisson_ratio": 0.3, "density": 1000.0},
+        "material": {"young_modulus": 1e5, "poisson_ratio": 0.3, "density": 1000.0, "model": "arap"},
     }
     return make(body, {"name": "floor", "mesh": {"shape": "plane", "size": 10.0}}, tolerance)
 

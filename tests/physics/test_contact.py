@@ -5,7 +5,7 @@ import pytest
 
 import pdipc
 
-from .scenes import floor, scene, solid, watched
+from .scenes import cloth, floor, scene, solid, watched
 
 G = 9.81
 
@@ -13,7 +13,8 @@ G = 9.81
 def test_free_collision_conserves_linear_momentum():
     a = solid("a", (0.2, 0.2, 0.2), (2, 2, 2), at=(-0.15, 0, 0), velocity=(2, 0, 0), density=500)
     b = solid("b", (0.2, 0.2, 0.2), (2, 2, 2), at=(0.15, 0.03, 0.02), velocity=(-1, 0, 0), rotation=(10, 20, 30))
-    simulation = watched(scene([a, b], gravity=(0, 0, 0), time_step=0.01, max_outer=100))
+    # what a step leaves unsolved is a force from outside: momentum is kept as far as steps converge
+    simulation = watched(scene([a, b], gravity=(0, 0, 0), time_step=0.01, tolerance=1e-6))
     mass = simulation.model.external.mass[:, None]
 
     def momentum():
@@ -66,34 +67,33 @@ def test_sticks_below_the_friction_angle():
 
 
 def test_a_gap_that_rounds_to_less_than_nothing_still_pushes():
-    """Layers of one cloth, 10 um apart at 100 m in float32: gaps are a few roundings, and measure as negative. No force is lost."""
-    x, z = np.meshgrid(np.linspace(0, 0.3, 5), np.linspace(0, 0.3, 5), indexing="ij")
-    layer = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
-    corners = (5 * np.arange(4)[:, None] + np.arange(4)).ravel()
-    triangles = np.concatenate([corners[:, None] + [0, 1, 6], corners[:, None] + [0, 6, 5]])
-    mesh = {"vertices": [*layer, *np.add(layer, [0.013, 1e-5, 0.017])], "triangles": [*triangles, *(triangles + 25)]}
-    place = {"translation": (100, 0, 0), "rotation": (10, 20, 30), "velocity": (0, -1, 0)}
+    """Sheets that meet at 100 m in float32: gaps are a few roundings, and may measure as negative. No force is lost."""
+    place = {"rotation": (10, 20, 30)}
+    low = cloth("low", (0.3, 0.3), (4, 4), at=(100, 0, 0), **place)
+    high = cloth("high", (0.3, 0.3), (4, 4), at=(100.01, 0.01, 0.02), velocity=(0, -60, 0), **place)
     contact = {"minimum_separation": 2e-3, "activation_distance": 5e-3}
-    made = watched(scene([{"name": "two", "kind": "cloth", "mesh": mesh, **place}], contact=contact, precision="float32"))
-    pressed = 0
+    made = watched(scene([low, high], contact=contact, precision="float32", max_outer=30))
+    pressed, smallest = 0, np.inf
     for _ in range(6):
         result = made.step()
         count = int(made.work.pairs.count.numpy()[0])
         pressed += count
-        assert np.isfinite(made.work.pairs.force.numpy()[:count]).all()
+        assert np.isfinite(made.work.pairs.slope.numpy()[:count]).all()
         assert result.smallest_gap > 0
+        smallest = min(smallest, result.smallest_gap)
     assert pressed > 20
+    assert smallest < 10 * np.spacing(np.float32(100))
 
 
 def test_the_stiffest_barriers_of_float32_stay_numbers():
-    """A ball thrown on a rod at 300 m/s leaves gaps whose barriers have determinants beyond float32."""
+    """A ball thrown on a rod at 3 km/s, under stiff barriers, leaves gaps whose barriers have determinants beyond float32."""
     ball = {"name": "ball", "kind": "solid", "mesh": {"shape": "sphere", "radius": 0.1, "cells": 4}}
-    ball |= {"translation": (0, 0.32, 0), "velocity": (0, -300, 0), "material": {"young_modulus": 1e5}}
+    ball |= {"translation": (0, 0.32, 0), "velocity": (0, -3000, 0), "material": {"young_modulus": 1e5}}
     rod = {"name": "rod", "mesh": {"shape": "cylinder", "radius": 0.01, "length": 1, "cells": [2, 1]}, "rotation": (90, 0, 0)}
-    contact = {"activation_distance": 6e-4}
+    contact = {"activation_distance": 6e-4, "stiffness_scale": 1e5}
     made = watched(scene([ball], [floor(2.0, at=(0, -0.1, 0)), rod], contact=contact, precision="float32"))
     stiffest = 0.0
-    for _ in range(3):
+    for _ in range(2):
         assert "not finite" not in made.step().message
         stiffest = max(stiffest, np.abs(made.work.pairs.diagonal.numpy()).max())
     assert stiffest > np.finfo("float32").max ** (1 / 3)

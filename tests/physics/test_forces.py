@@ -109,7 +109,7 @@ def test_a_held_cloth_in_a_storm_is_no_faster_than_the_air():
 
 def test_a_pull_that_is_let_go_no_longer_acts():
     body = solid("block", [0.1, 0.1, 0.1], [1, 1, 1])
-    simulation = pdipc.Simulation(scene([body], [], gravity=[0.0, 0.0, 0.0]), "cpu")
+    simulation = pdipc.Simulation(scene([body], [], gravity=[0.0, 0.0, 0.0], tolerance=1e-8), "cpu")
     weight = simulation.model.external.mass.sum()
     every = np.arange(8)
     speeds = []

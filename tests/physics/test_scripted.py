@@ -1,4 +1,4 @@
-"""What follows a script and is held up: it goes as far as the step allows, and a converged step is one where it arrives."""
+"""What follows a script and is held up: it goes as far as the step allows, and the result says how far behind it is."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_closing_boards_arrive():
     for _ in range(8):
         result = simulation.step()
         lag = np.abs(simulation.positions[assembly.kinematic_vertices] - assembly.kinematic_positions(simulation.state.time))
-        assert lag.max() < 1e-9 or not result.converged
+        assert result.lag == pytest.approx(lag.max(), abs=1e-9)
         assert len(pdipc.find_intersections(simulation.positions, simulation.triangles, assembly.obstacle)) == 0
     assert lag.max() < 1e-9
 
@@ -43,4 +43,5 @@ def test_a_pin_cannot_lead_a_cloth_through_an_obstacle_or_another_pinned_cloth(s
         results = [simulation.step() for _ in range(3)]
         lowest = 0.0 if obstacles else 0.01
         assert 0.0 < simulation.positions[: 5 * 5, 1].min() - lowest < 1e-3
-        assert method == "paper" or not results[-1].converged  # the script says 7 cm below
+        assert results[-1].lag > 0.06  # the script says 7 cm below
+        assert method == "paper" or "behind its target" in results[-1].message

@@ -55,13 +55,17 @@ def test_a_body_may_be_put_elsewhere():
     assert made.positions[:27, 1].min() > 0.5
 
 
-@pytest.mark.parametrize("name", ["velocities", "accelerations"])
-def test_velocities_that_are_no_numbers_are_told_and_gone(name):
-    made = simulation()
+@pytest.mark.parametrize(
+    ("name", "method"), [("velocities", "newton"), ("velocities", "local-global"), ("accelerations", "local-global")]
+)
+def test_velocities_that_are_no_numbers_are_told_and_gone(name, method):
+    """Newton's method has no use for accelerations."""
+    made = simulation(nonlinear_solver=method)
     write(made, name, lambda values: values[3].fill(np.nan))
     before = made.positions
     assert "not finite" in made.step().message
-    assert np.array_equal(made.positions, before)
+    # what rounding had left of the last position may be added to it
+    np.testing.assert_allclose(made.positions, before, rtol=0.0, atol=1e-18)
     made.step()
     assert made.step().converged
 

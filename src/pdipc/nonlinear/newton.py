@@ -385,8 +385,9 @@ def kernels(real: Real) -> SimpleNamespace:
         residual = numbers[status.MOVED]
         behind = numbers[status.LAG] > scalar(0.0)
         driven = drive[0] != 0
-        # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes
-        ratio = scalar(0.0)
+        # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes.
+        # One motion alone says nothing: the first step out of a stiff barrier is short, however far the way is that it opens
+        ratio = scalar(0.99)
         if count[status.OUTER] > 0:
             ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
         left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))

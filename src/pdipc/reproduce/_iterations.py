@@ -1,5 +1,6 @@
 """What happens inside one step (Figures 4 and 5): potential and place after every local-global iteration, three ways."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import warp as wp
 from pdipc.barrier.potential import EXTENSION
 from pdipc.drive import Work, step
 from pdipc.model import Model, State, build
+from pdipc.nonlinear import status
 from pdipc.paper_mode import energy_rate
+from pdipc.paper_mode.printed import Printed
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
 
@@ -39,25 +42,37 @@ class Watched(Work):
     def __init__(self, model: Model):
         super().__init__(model, recorded=False)
         self.trace, self.lowest = Trace(), 0
-        self.printed_tolerance, self.truncated_tolerance = self.truncated_tolerance, 0.0
+        self.method._local_global = self._seen(self.method._local_global, self._after_local_global)
+        self.method.accept = self._seen(self.method.accept, self._after_outer)
 
-    def start(self) -> None:
-        """As `Work.start`; a step that is taken again, since a list was full, is told from the beginning."""
-        super().start()
+    @staticmethod
+    def _seen(launches: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
+        def both() -> None:
+            launches()
+            after()
+
+        return both
+
+    def start_clock(self) -> None:
+        """As `Work.start_clock`; a step that is taken again, since a list was full, is told from the beginning."""
+        super().start_clock()
         self.trace = Trace()
 
-    def _local_global(self) -> None:
-        super()._local_global()
+    def _after_local_global(self) -> None:
         self.trace.potential.append(potential(self))
-        self.trace.height.append(float(self.x_tilde.numpy()[self.lowest, 1]))
+        self.trace.height.append(float((self.x_start.numpy() + self.u_tilde.numpy())[self.lowest, 1]))
 
-    def outer_iteration(self) -> None:
-        """As `Work.outer_iteration`; notes where it ended."""
-        super().outer_iteration()
+    def _after_outer(self) -> None:
+        """Notes where it ended."""
         self.trace.outer.append(len(self.trace.potential))
-        ended = self.residual.numpy()[0] <= self.printed_tolerance if self.as_printed else self.going.numpy()[0] == 0
-        if ended and self.trace.stopped is None:
+        count = self.count.numpy()
+        if count[status.STATUS] != status.CONVERGED:
+            return
+        if self.trace.stopped is None:
             self.trace.stopped = len(self.trace.potential)
+        settings = self.model.settings
+        if settings.method == "paper" and count[status.OUTER] < settings.max_outer:
+            self.going.fill_(1)
 
 
 def potential(work: Work) -> float:
@@ -66,13 +81,14 @@ def potential(work: Work) -> float:
     As printed B is that of the position targets. In the default mode it is Eq. (4) in each pair's linearized gap, and below half
     of the gap at the start of the outer iteration a parabola: iterates may be past contact.
     """
-    if work.as_printed:
-        return float(work.inner.energies.numpy()[energy_rate.TOTAL])
+    method = work.method
+    if isinstance(method, Printed):
+        return float(method.loop.energies.numpy()[energy_rate.TOTAL])
     model, h = work.model, work.model.settings.time_step
-    x, z, start = (array.numpy() for array in (work.x_tilde, work.z, work.x))
+    x, z, start = (array.numpy() for array in (work.u_tilde, work.z, work.u))
     inertia = 0.5 * float((model.mass.numpy()[:, None] * (x - z) ** 2).sum()) / h**2
     elastic = wp.zeros(1, dtype=model.real.scalar, device=model.device.warp)
-    model.projector.energy(work.x_tilde, elastic, 0)
+    model.projector.energy(work.x_start, work.u_tilde, elastic, 0)
     p = work.pairs
     count = int(p.count.numpy()[0])
     quads, a, n, gap, d_hat, stiffness = (

@@ -40,7 +40,7 @@ def falling(radius: float, small: bool) -> Scene:
         "rotation": (0.0, 0.0, 90.0),
         "translation": (0.0, 0.005 - lowest, 0.0),
         "velocity": (0.0, -SPEED, 0.0),
-        "material": {"density": DENSITY, "young_modulus": YOUNG_MODULUS, "poisson_ratio": 0.0},
+        "material": {"density": DENSITY, "young_modulus": YOUNG_MODULUS, "poisson_ratio": 0.0, "model": "arap"},
     }
     return Scene(
         title="A dinosaur falls on rods",

@@ -43,7 +43,7 @@ def flattened(small: bool) -> Scene:
         "name": "armadillo",
         "kind": "solid",
         "mesh": {"vertices": x, "tets": tets},
-        "material": {"density": DENSITY, "young_modulus": YOUNG_MODULUS, "poisson_ratio": 0.0},
+        "material": {"density": DENSITY, "young_modulus": YOUNG_MODULUS, "poisson_ratio": 0.0, "model": "arap"},
     }
     simulation = {"steps": steps, "time_step": H, "gravity": (0.0, 0.0, 0.0)}
     return Scene(title="A flattened Armadillo", simulation=simulation, bodies=[body], obstacles=boards)

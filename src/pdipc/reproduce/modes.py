@@ -49,9 +49,9 @@ class Case:
 
 
 def block(name: str, at: tuple, cells: int = 3, young: float = 1e5, **more: Any) -> dict:
-    """A cube of 0.1 m."""
+    """A cube of 0.1 m, with the energies that IPC has here as well."""
     mesh = {"shape": "box", "size": (0.1, 0.1, 0.1), "cells": (cells, cells, cells)}
-    material = {"young_modulus": young, "poisson_ratio": 0.0, "density": 1000.0}
+    material = {"young_modulus": young, "poisson_ratio": 0.0, "density": 1000.0, "model": "arap"}
     return {"name": name, "kind": "solid", "mesh": mesh, "translation": at, "material": material, **more}
 
 
@@ -103,7 +103,13 @@ def cases() -> dict[str, Case]:
         "ball on a cloth": Case(
             [
                 sheet(12, (0, 0, 0), pins=[{"select": {"box": ((x - 0.02, -1, -1), (x + 0.02, 1, 1))}} for x in (-0.15, 0.15)]),
-                {"name": "ball", "kind": "solid", "mesh": ball, "translation": (0.01, 0.08, 0.0)},
+                {
+                    "name": "ball",
+                    "kind": "solid",
+                    "mesh": ball,
+                    "translation": (0.01, 0.08, 0.0),
+                    "material": {"model": "arap"},
+                },
             ],
             [],
             60,
