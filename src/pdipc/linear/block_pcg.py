@@ -72,16 +72,24 @@ class BlockPcg:
         if self.modes.groups:
             self.modes.prepare(x, contacts)
 
-    def solve(self, p: wp.array, b: wp.array, contacts: list[Coupling], tolerated: float, loose: wp.array) -> None:
+    def solve(
+        self,
+        p: wp.array,
+        b: wp.array,
+        contacts: list[Coupling],
+        tolerated: float,
+        loose: wp.array,
+        tolerance: float | None = None,
+    ) -> None:
         """Launches the solution of K p = b. p: (n,) vec3, m; the start on entry, the solution on return; entries that are not free stay.
 
         tolerated: N^(1/2) m^(1/2), the norm below which a residual is as good as none. loose: (1,) int32 on the device, whether LOOSE times the
-        tolerance will do.
+        tolerance will do. tolerance: where another one than the solver's own is wanted.
         """
         k, sums, m = self._kernels, self.sums, self.matrix
         rows = [m.offsets, m.columns, m.values, m.held]
         status = [self._first, self._left, self.iterations, self._residual, self._going]
-        limits = [loose, self.real.scalar(self.tolerance), self.most]
+        limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
         self.device.launch(k.clear, m.count, [self._w])
         for c in contacts:
             c.apply(p, self._w)

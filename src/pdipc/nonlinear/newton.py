@@ -46,6 +46,10 @@ SLACK = {
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
 KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
+REBOUND_TOLERANCE = {
+    "float32": 1.0e-5,
+    "float64": 1.0e-9,
+}  # of the one solve for restitution: what is left of it acts as from outside
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
 
@@ -627,7 +631,7 @@ class Newton:
             [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
         )
         self.solver.prepare(w.x, [self.pairs])
-        self.solver.solve(self.p, r.zero, [self.pairs], 0.0, self.still)
+        self.solver.solve(self.p, r.zero, [self.pairs], 0.0, self.still, REBOUND_TOLERANCE[model.real.name])
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
 
