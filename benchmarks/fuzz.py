@@ -350,7 +350,8 @@ def main() -> int:
             for precision in ("float64", "float32"):  # kernels are compiled here, and not on the time of an input
                 compiled = pdipc.Scene(**table)
                 compiled.simulation.precision = precision
-                pdipc.Simulation(compiled, "cpu").step()
+                with contextlib.suppress(SceneError):  # one of them is too fine for float32
+                    pdipc.Simulation(compiled, "cpu").step()
         for number in [given.only] if given.only is not None else range(given.inputs):
             if time.monotonic() - begun > given.seconds:
                 break

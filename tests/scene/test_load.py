@@ -8,9 +8,10 @@ import pytest
 from pdipc.linear.solvers import SOLVERS
 from pdipc.scene import reference
 from pdipc.scene.assembly import assemble
+from pdipc.scene.check import check
 from pdipc.scene.errors import SceneError
 from pdipc.scene.load import bundled_scenes, load_scene
-from pdipc.scene.schema import Arrays, Cloth, ClothMaterial, Scene, Simulation, Solid
+from pdipc.scene.schema import Arrays, Cloth, ClothMaterial, Scene, Simulation, Solid, uses_newton
 
 GOOD = """
 [[bodies]]
@@ -110,6 +111,16 @@ def test_a_scene_survives_json(tmp_path):
     (tmp_path / "scene.json").write_text(scene.model_dump_json())
     scene.obstacles[0].mesh = str(tmp_path / "a.obj")
     assert load_scene(tmp_path / "scene.json") == scene
+
+
+def test_a_scene_from_json_is_solved_as_the_one_that_was_written(tmp_path):
+    """A run goes on from its scene.json, which names every setting: what is the default there was not chosen."""
+    for settings in ({}, {"linear_iterations": 30}, {"nonlinear_solver": "newton"}, {"nonlinear_solver": "local-global"}):
+        scene = Scene(bodies=[{"name": "c", "kind": "cloth", "mesh": {"shape": "grid"}}], simulation=settings)
+        (tmp_path / "scene.json").write_text(scene.model_dump_json())
+        again = load_scene(tmp_path / "scene.json")
+        assert uses_newton(again.simulation) == uses_newton(scene.simulation)
+        assert check(again) == check(scene) == []
 
 
 def test_cloth_stiffness_follows_from_young_modulus_and_thickness():

@@ -107,7 +107,7 @@ def test_polygons_without_measure_end_soon():
     rng = np.random.default_rng(0)
     line = np.column_stack([np.linspace(0, 1, 500), np.zeros(500), np.zeros(500)])
     round_ = np.exp(2j * np.pi * np.arange(1000) / 1000)
-    begun = time.monotonic()
+    begun = time.process_time()
     for points, crosses in (
         (rng.random((500, 3)), 1),
         (line, 0),
@@ -115,7 +115,7 @@ def test_polygons_without_measure_end_soon():
     ):
         triangles, crossed = cells.triangulate(points, np.arange(len(points)), np.array([len(points)]))
         assert (len(triangles), crossed) == (len(points) - 2, crosses)
-    assert time.monotonic() - begun < 30.0
+    assert time.process_time() - begun < 30.0
     many = cells.MOST_CORNERS + 1
     contents = meshes.Contents(np.zeros((many, 3)), polygons=(np.arange(many), np.array([many])))
     with pytest.raises(SceneError, match=f"here: a face has {many} corners; at most {cells.MOST_CORNERS} are cut"):
@@ -406,17 +406,19 @@ def test_a_glb_says_what_it_leaves_out(tmp_path):
     ],
 )
 def test_parsers_that_never_end_are_ended(tmp_path, monkeypatch, text, message):
-    monkeypatch.setattr(worker, "SECONDS", 1.0)
+    monkeypatch.setattr(worker, "SECONDS", 1.0)  # of work; how long that takes by the clock is the machine's
+    monkeypatch.setattr(worker, "WAITING", 600.0)
     (tmp_path / "a.msh").write_text(text)
     begun = time.monotonic()
     with pytest.raises(SceneError, match=message) as caught:
         meshes.read(tmp_path / "a.msh")
     assert str(tmp_path / "a.msh") in str(caught.value)
-    assert time.monotonic() - begun < 30.0
+    assert time.monotonic() - begun < 300.0
 
 
 def test_one_process_reads_many_files_and_goes_on_after_a_failure(tmp_path, monkeypatch):
-    monkeypatch.setattr(worker, "SECONDS", 1.0)
+    monkeypatch.setattr(worker, "SECONDS", 1.0)  # of work; how long that takes by the clock is the machine's
+    monkeypatch.setattr(worker, "WAITING", 600.0)
     meshio.Mesh(QUAD_AND_TRIANGLES, [("triangle", [[1, 2, 5]])]).write(tmp_path / "good.vtu")
     (tmp_path / "bad.vtu").write_text("nonsense")
     (tmp_path / "endless.msh").write_text("(10 (0 1 1b 0))\n(301")

@@ -14,7 +14,7 @@ from pdipc.scene import meshes
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.errors import SceneError
 from pdipc.scene.load import RightPart, load_right_part
-from pdipc.scene.schema import LOCAL_GLOBAL_ONLY, Scene, uses_newton
+from pdipc.scene.schema import Scene, local_global_settings, uses_newton
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -110,7 +110,7 @@ def _settings(scene: Scene) -> Iterator[Finding]:
     if sim.tolerance is not None and sim.outer_tolerance is not None:
         yield Finding("simulation.outer_tolerance", "is given beside tolerance, and both say the same", "leave one of them out")
     if sim.nonlinear_solver == "newton":
-        for name in sorted(sim.model_fields_set & LOCAL_GLOBAL_ONLY):
+        for name in local_global_settings(sim):
             yield Finding(f"simulation.{name}", "has no effect with the Newton solver", 'leave it out, or take "local-global"')
     if method == "paper" and sim.nonlinear_solver != "auto":
         found = f'is "{sim.nonlinear_solver}", but the paper\'s contact has its own'

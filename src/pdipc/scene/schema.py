@@ -127,8 +127,13 @@ def uses_newton(simulation: Simulation) -> bool:
     """Whether the barrier's contact is solved by Newton's method."""
     if simulation.nonlinear_solver != "auto":
         return simulation.nonlinear_solver == "newton"
-    chosen = {name for name in simulation.model_fields_set & LOCAL_GLOBAL_ONLY if getattr(simulation, name) != "auto"}
-    return not chosen
+    return not local_global_settings(simulation)
+
+
+def local_global_settings(simulation: Simulation) -> list[str]:
+    """The settings of local-global that differ from their defaults: whether one was given does not survive a file of all settings."""
+    fields = type(simulation).model_fields
+    return sorted(name for name in LOCAL_GLOBAL_ONLY if getattr(simulation, name) != fields[name].default)
 
 
 class Contact(Table):
