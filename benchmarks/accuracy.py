@@ -70,7 +70,7 @@ def three_bodies(small: bool) -> pdipc.Scene:
 
 
 def scene(bodies: list, obstacles: list) -> pdipc.Scene:
-    simulation = {"precision": "float64", "linear_tolerance": 1e-2}
+    simulation = {"precision": "float64", "nonlinear_solver": "local-global", "linear_tolerance": 1e-2}
     return pdipc.Scene(bodies=bodies, obstacles=obstacles, simulation=simulation, contact={"activation_distance": 2e-3})
 
 

@@ -119,7 +119,12 @@ def scene(small: bool, method: str, inner_iterations: int) -> Scene:
         "material": {"young_modulus": 2e5, "poisson_ratio": 0.3, "density": 1000.0},
     }
     return Scene(
-        simulation={"precision": "float64", "inner_iterations": inner_iterations, "max_outer": 12 if small else 30},
+        simulation={
+            "precision": "float64",
+            "nonlinear_solver": "auto" if method == "paper" else "local-global",
+            "inner_iterations": inner_iterations,
+            "max_outer": 12 if small else 30,
+        },
         contact={"method": method, "activation_distance": 5e-3, "stiffness_scale": 100.0},
         bodies=[body],
         obstacles=[{"name": "floor", "mesh": {"shape": "plane", "size": 6.0}}],
