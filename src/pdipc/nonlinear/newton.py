@@ -472,11 +472,21 @@ class Newton:
         work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
         simulated = [body for body in assembly.bodies if not body.kinematic]
         ranges = [(body.first, body.last) for body in simulated]
-        joined = np.array(
-            [(assembly.body_of_vertex[a.vertices_a[0]], assembly.body_of_vertex[a.vertices_b[0]]) for a in assembly.attachments]
-        ).reshape(-1, 2)
         inside = assembly.body_of_vertex < len(simulated)
-        pinned = np.flatnonzero(inside & ~free)
+        ties = np.concatenate(
+            [np.zeros((0, 2), dtype=np.int32)] + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+        )
+        both = inside[ties].all(axis=1)
+        joined = np.unique(assembly.body_of_vertex[ties[both]], axis=0)
+        held_vertices = np.flatnonzero(inside & ~free)
+        to_obstacles = np.concatenate([ties[~both], ties[~both][:, ::-1]])
+        to_obstacles = to_obstacles[~inside[to_obstacles[:, 0]] & inside[to_obstacles[:, 1]]]
+        pinned = np.column_stack(
+            [
+                np.concatenate([held_vertices, to_obstacles[:, 0]]),
+                assembly.body_of_vertex[np.concatenate([held_vertices, to_obstacles[:, 1]])],
+            ]
+        )
         self.islands = Islands(device, real, n, ranges, joined, pinned)
         work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
         work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
