@@ -19,7 +19,9 @@ from pdipc.work import Work
 def block(young, **more):
     """A block just above the floor, turned, on its way down."""
     of = {"young": young, "poisson": 0.3, "rotation": (10, 0, 15), "velocity": (0.2, -1.0, 0.0), **more}
-    return scene([solid("block", (0.1, 0.1, 0.1), (3, 3, 3), at=(0, 0.075, 0), **of)], [floor(1.0)], contact=CONTACT, time_step=0.01)
+    return scene(
+        [solid("block", (0.1, 0.1, 0.1), (3, 3, 3), at=(0, 0.075, 0), **of)], [floor(1.0)], contact=CONTACT, time_step=0.01
+    )
 
 
 def sheet_on_ball():
@@ -29,7 +31,9 @@ def sheet_on_ball():
 
 def pile():
     low = solid("low", (0.1, 0.1, 0.1), (2, 2, 2), at=(0, 0.0515, 0), young=1e6)
-    top = solid("top", (0.08, 0.08, 0.08), (2, 2, 2), at=(0.01, 0.144, 0.005), rotation=(0, 20, 0), young=1e8, velocity=(0, -1, 0))
+    top = solid(
+        "top", (0.08, 0.08, 0.08), (2, 2, 2), at=(0.01, 0.144, 0.005), rotation=(0, 20, 0), young=1e8, velocity=(0, -1, 0)
+    )
     return scene([low, top], [floor(1.0)], contact=CONTACT, time_step=0.01)
 
 
@@ -131,7 +135,17 @@ def test_a_cube_on_its_corner_falls_over(young, density):
     turn = (40, 0, 30)
     corners = 0.05 * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     low = Rotation.from_euler("xyz", turn, degrees=True).apply(corners)[:, 1].min()
-    cube = solid("cube", (0.1,) * 3, (2,) * 3, at=(0, 0.002 - low, 0), rotation=turn, young=young, density=density, poisson=0.3, friction=0.3)
+    cube = solid(
+        "cube",
+        (0.1,) * 3,
+        (2,) * 3,
+        at=(0, 0.002 - low, 0),
+        rotation=turn,
+        young=young,
+        density=density,
+        poisson=0.3,
+        friction=0.3,
+    )
     contact = {"activation_distance": 1e-3}
     made = watched(scene([cube], [floor(4.0, friction=0.3)], contact=contact, time_step=0.01))
     results = [made.step() for _ in range(50)]
