@@ -70,7 +70,9 @@ def vector(rng, size: float) -> list[float]:
 def far_from_origin(rng):
     single = rng.random() < 0.4
     place = np.array(vector(rng, power(rng, 1, 3) if single else power(rng, 2, 8)))
-    bodies = [sheet("cloth", translation=(place + [0, 0.32, 0]).tolist(), rotation=turn(rng, 10), velocity=vector(rng, 3))]
+    bodies = [
+        sheet("cloth", translation=(place + np.array([0, 0.32, 0])).tolist(), rotation=turn(rng, 10), velocity=vector(rng, 3))
+    ]
     d = 2e-2 if single else max(2e-3, 1e-7 * np.linalg.norm(place))
     contact = {"activation_distance": d}
     return bodies, [ball("ball", 0.25, translation=place.tolist())], {"precision": "float32" if single else "float64"}, contact
