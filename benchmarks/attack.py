@@ -305,11 +305,14 @@ def make(family, number: int, seed: int) -> tuple[pdipc.Scene, str]:
     method = str(rng.choice(["barrier"] * 4 + ["paper"]))
     common = {
         "precision": str(rng.choice(["float64", "float32"])),
-        "linear_solver": "a-jacobi" if method == "paper" and rng.random() < 0.5 else str(rng.choice(SOLVERS)),
         "max_outer": int(rng.choice([1, 2, 5, 12])),
         "time_step": float(rng.choice([0.001, 0.01, 0.04])),
-        "inner_iterations": int(rng.choice([2, 10, 30])),
     }
+    if method == "barrier" and rng.random() < 0.6:
+        common |= {"nonlinear_solver": "newton"}
+    else:
+        common |= {"linear_solver": "a-jacobi" if method == "paper" and rng.random() < 0.5 else str(rng.choice(SOLVERS))}
+        common |= {"inner_iterations": int(rng.choice([2, 10, 30]))}
     kept = {
         "method": method,
         "broad_phase": str(rng.choice(["patches", "bvh"])),
