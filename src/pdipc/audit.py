@@ -60,8 +60,10 @@ def audit(model: Model, state: State, work: Work) -> Audit:
 def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
     """(n, 3) N: the barrier's force on every vertex, on obstacles too; the resultant on a body is the sum over its vertices.
 
-    Without friction, which depends on a step and not on a state alone.
+    Without friction, which depends on a step and not on a state alone. So do the targets of the paper's contact: there all is NaN.
     """
+    if model.settings.method == "paper":
+        return np.full((model.vertex_count, 3), np.nan)
     work.list_pairs(state.positions)
     return work.pairs.forces(state.positions).numpy().astype(np.float64)
 

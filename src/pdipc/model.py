@@ -9,7 +9,7 @@ import scipy.sparse
 import warp as wp
 
 from pdipc import constraints
-from pdipc.collision import broad_phase, surface
+from pdipc.collision import surface
 from pdipc.constraints import (
     corotated,
     curved_bending,
@@ -135,7 +135,6 @@ class Model:
     free_vertices: np.ndarray
     held: np.ndarray
     surface: surface.Surface
-    broad_phase: broad_phase.BroadPhase
     external: ExternalForces
     rigid: list[tuple[int, int]]
     triangles: np.ndarray
@@ -294,7 +293,6 @@ def build(scene: Scene, device: str | None = None) -> Model:
         free_vertices=free,
         held=held,
         surface=skin,
-        broad_phase=broad_phase.BroadPhase(place, number, skin, scene.contact.broad_phase),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
         rigid=[
             (b.first, b.last) for b in assembly.bodies if b.trajectory and b.trajectory.is_rigid and not b.trajectory.is_static

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import warp as wp
 
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
+from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.candidates import Candidates
 from pdipc.collision.truncation import Truncation
 from pdipc.device import system
@@ -58,7 +59,7 @@ class Work:
             device,
             real,
             model.surface,
-            model.broad_phase,
+            BroadPhase(device, real, model.surface, model.scene.contact.broad_phase),
             model.assembly.rest_positions,
             model.half_separation,
             settings.activation_distance,

@@ -64,6 +64,14 @@ def test_bodies_at_rest_carry_what_lies_on_them(resting):
     assert 0.3 < np.median(pressure[under]) / (2 * MASS * G / 0.04) < 2.0
 
 
+def test_forces_of_the_papers_targets_are_not_made_up():
+    """They belong to a step: of a state alone they are unknown, and no number says so."""
+    block = solid("block", (0.2, 0.2, 0.2), (2, 2, 2), at=(0, 0.1013, 0))
+    made = pdipc.Simulation(scene([block], [floor()], contact={"method": "paper"}), "cpu")
+    made.step()
+    assert all(np.isnan(force).all() for force in body_forces(made.model, made.state, made.work).values())
+
+
 def test_command_prints_plots_and_writes_forces(resting, tmp_path):
     pytest.importorskip("matplotlib", reason="needs matplotlib (extra: pictures)")
     picture, numbers = tmp_path / "audit.png", tmp_path / "forces.npz"

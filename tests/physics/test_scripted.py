@@ -45,3 +45,19 @@ def test_a_pin_cannot_lead_a_cloth_through_an_obstacle_or_another_pinned_cloth(s
         assert 0.0 < simulation.positions[: 5 * 5, 1].min() - lowest < 1e-3
         assert results[-1].lag > 0.06  # the script says 7 cm below
         assert method == "paper" or "behind its target" in results[-1].message
+
+
+def test_a_cloth_hangs_from_a_moving_obstacle_by_springs():
+    """Attachments may end at an obstacle, which then moves the body."""
+    cloth = {"name": "c", "kind": "cloth", "mesh": {"shape": "grid", "cells": [4, 4], "size": [0.4, 0.4]}}
+    bar = {
+        "name": "o",
+        "mesh": {"shape": "plane", "size": 0.4},
+        "translation": [0, 0.3, 0],
+        "motion": {"velocity": [0.5, 0, 0]},
+    }
+    springs = {"bodies": ["c", "o"], "pairs": [[0, 0], [4, 1], [20, 2], [24, 3]], "stiffness": 1000.0}
+    sim = pdipc.Simulation(pdipc.Scene(bodies=[cloth], obstacles=[bar], attachments=[springs]), "cpu")
+    assert all(sim.step().converged for _ in range(40))
+    assert 0.1 < sim.positions[:25, 0].mean() < 0.25, "it follows the bar, which has gone 0.2 m"
+    assert -0.2 < sim.positions[:25, 1].mean() < 0.0, "and hangs below it"

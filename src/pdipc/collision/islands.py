@@ -98,17 +98,16 @@ def kernels(real: Real):
     @wp.kernel(module=module)
     def mark_pinned(
         first: int,
-        pinned: wp.array(dtype=wp.int32),
-        island_of: wp.array(dtype=wp.int32),
+        pinned: wp.array(dtype=wp.vec2i),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
         driven_out: wp.array(dtype=wp.int32),
     ):
-        """Bodies of which a held vertex moves."""
+        """Bodies that a scripted vertex moves: one of their own, or one of an obstacle that they are attached to."""
         i = first + wp.tid()
-        v = pinned[i]
+        v = pinned[i][0]
         if wp.length_sq(u_tilde[v] - u[v]) > zero:
-            driven_out[island_of[v]] = 1
+            driven_out[pinned[i][1]] = 1
 
     return SimpleNamespace(clear=clear, connect=connect, label=label, mark_driven=mark_driven, mark_pinned=mark_pinned)
 
@@ -117,8 +116,8 @@ class Islands:
     """body: (n,) int32, the simulated body of each vertex, -1 for obstacles. label: (bodies,) the island of each body, named by its first body.
     driven: (bodies,) whether something that follows a script moves the body in this outer iteration.
 
-    ranges: (first, last) vertices of each simulated body; joined: (k, 2) bodies that attachments join; pinned: (k,) held vertices of
-    simulated bodies.
+    ranges: (first, last) vertices of each simulated body; joined: (k, 2) bodies that attachments join; pinned: (k, 2) scripted
+    vertices and the simulated bodies that they move: their own, or those attached to them.
     """
 
     def __init__(
@@ -145,7 +144,8 @@ class Islands:
         def upload(values: np.ndarray) -> wp.array:
             return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=device.warp)
 
-        self.body, self._fixed, self.label, self._pinned = upload(of), upload(fixed), upload(fixed), upload(pinned)
+        self.body, self._fixed, self.label = upload(of), upload(fixed), upload(fixed)
+        self._pinned = wp.array(pinned.reshape(-1, 2).astype(np.int32), dtype=wp.vec2i, device=device.warp)
         self._pinned_count = len(pinned)
         size = 1 if self.together else max(1, self.count**2)
         self._near = wp.zeros(size, dtype=wp.int32, device=device.warp)
@@ -169,4 +169,4 @@ class Islands:
         for c in candidates.lists:
             device.launch_list(k.mark_driven, c.capacity, [c.count, c.quads, self.body, u, u_tilde, self.driven])
         if self._pinned_count:
-            device.launch(k.mark_pinned, self._pinned_count, [self._pinned, self.body, u, u_tilde, self.driven])
+            device.launch(k.mark_pinned, self._pinned_count, [self._pinned, u, u_tilde, self.driven])

@@ -202,10 +202,12 @@ def kernels(real: Real) -> SimpleNamespace:
         found_out[p] = traverse(patches, p, 0, False)
 
     @wp.kernel(module=module)
-    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32)):
+    def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
         p = first + wp.tid()
         begin = patches.neighbours_end[p] - found[p]
-        if begin >= 0 and patches.neighbours_end[p] <= patches.capacity:  # else the list overflows, or the scan has wrapped
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31: the scan has wrapped, and its end may look as if all fits
+        elif patches.neighbours_end[p] <= patches.capacity:
             traverse(patches, p, begin, True)
 
     @wp.func
@@ -472,7 +474,7 @@ class PatchCulling:
         device.scan(self.found, tree.neighbours_end)
         inputs = [tree.neighbours_end, tree.capacity, self.neighbour_count, self.overflow]
         device.launch_serial(self.sweep.settle, inputs)
-        device.launch(k.list_neighbours, self.count, [tree, self.found], grain=64)
+        device.launch(k.list_neighbours, self.count, [tree, self.found, self.overflow], grain=64)
         inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, of_vertices, sieve]
         self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
         self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges, sieve])

@@ -9,8 +9,9 @@ committed.
 positions that are committed, and CCD was asked about just these. A pair that has a shortened vertex is asked in every pass, if it
 is listed; a pair without one makes the motion of the first pass, where it was not hit, or all its vertices would be shortened; it was
 listed there, or proven apart all the way. A pair that is not listed is apart by the lemmas of `candidates`, since the list was made for
-this motion or one that `check` compared with it. Where the passes do not settle nobody moves, and x is feasible. Times only choose what to
-try: no rounding in them, in fractions or in x + f (x~ - x) matters.
+this motion or one that `check` compared with it. Whatever shortens a vertex (a pair's time, its neighbours, a line search that begins at a
+later pass) leaves a fraction below 1. Where the passes do not settle nobody moves: x_end = base + u, which is x to the bit, and feasible.
+Times only choose what to try: no rounding in them, in fractions or in base + u + f (u~ - u) matters.
 
 The paper truncates every vertex by the one smallest time (`per_vertex=False`): correct, but one collision anywhere then
 drags every body of the scene (docs/paper_map.md).

@@ -7,6 +7,11 @@ The potential of a step is that of Section 3, with the barrier and lagged fricti
 over the displacements u since the start of the step. Its Hessian is made positive semidefinite element by element and pair by pair, and
 conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free nonlinear programming ... could fit in Alg. 1").
 
+The step is straight, and a straight step that rotates a body stretches it, by the square of the angle: for a body of steel more than a few
+microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So where no vertex of a
+body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
+p by its square, so it descends as p does, and solves as fast as p where that is small.
+
 After truncation Phi is compared, island by island. Where it rose, the island goes back along the same direction: first all of it to the least
 fraction that truncation left to one of its vertices, then by halves. What CCD has not proven is proven anew. So every outer iteration descends,
 unless a script moves something that the island may touch: then the potential itself has changed.
@@ -39,11 +44,14 @@ FRICTION_LAGS = (
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 DRIVES = 24  # outer iterations in which scripted vertices go on to their targets, at most
+SAMPLES = 128  # vertices of a body that tell how it rotates
+MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
 SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
+EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
 REBOUND_TOLERANCE = {
@@ -67,6 +75,10 @@ def kernels(real: Real) -> SimpleNamespace:
             d = wide(a[k]) - wide(b[k])
             total += d * d
         return total
+
+    @wp.func
+    def widened(a: vec3) -> wp.vec3d:
+        return wp.vec3d(wide(a[0]), wide(a[1]), wide(a[2]))
 
     @wp.kernel(module=module)
     def inertia(
@@ -116,6 +128,75 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] == scalar(0.0) and drive[0] != 0:
             p_out[i] = (target[i] - base[i]) - u[i]
 
+    @wp.func
+    def sampled(k: int, number: int, count: int) -> int:
+        """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
+        return (k * count) / number + (k * 37) % (count / number)
+
+    @wp.kernel(module=module)
+    def find_turn(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        whole: wp.array(dtype=wp.int32),
+        mass: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+        center_out: wp.array(dtype=wp.vec3d),
+        turn_out: wp.array(dtype=wp.vec3d),
+    ):
+        """By how much the step p rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held."""
+        b = first + wp.tid()
+        start = starts[b]
+        count = ends[b] - start
+        number = wp.min(count, SAMPLES)
+        origin = base[start]
+        center = wp.vec3d()
+        turn = wp.vec3d()
+        if whole[b] != 0:
+            total = wide(0.0)
+            mean = wp.vec3d()
+            for k in range(number):
+                i = start + sampled(k, number, count)
+                m = wide(mass[i])
+                total += m
+                center += m * widened((base[i] - origin) + u[i])
+                mean += m * widened(p[i])
+            center = center / total
+            mean = mean / total
+            momentum = wp.vec3d()
+            square = wide(0.0)
+            outer = wp.mat33d()
+            for k in range(number):
+                i = start + sampled(k, number, count)
+                m = wide(mass[i])
+                arm = widened((base[i] - origin) + u[i]) - center
+                momentum += m * wp.cross(arm, widened(p[i]) - mean)
+                square += m * wp.length_sq(arm)
+                outer += m * wp.outer(arm, arm)
+            # a little more than the inertia, for bodies on a line
+            turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * momentum
+            if not (wp.length(turn) < wide(MOST_TURN)):
+                turn = wp.vec3d()
+        center_out[b] = widened(origin) + center
+        turn_out[b] = turn
+
+    @wp.func
+    def curved(arm: wp.vec3d, turn: wp.vec3d) -> vec3:
+        """What rotating by `turn` does beyond turn x arm."""
+        angle = wp.length(turn)
+        result = wp.vec3d()
+        if angle > wide(0.0):
+            along = wp.cross(turn, arm)
+            half = wp.sin(wide(0.5) * angle) / angle
+            # sin(a) / a - 1 without cancellation
+            less = -angle * angle / wide(6.0) * (wide(1.0) - angle * angle / wide(20.0))
+            if angle > wide(0.05):
+                less = wp.sin(angle) / angle - wide(1.0)
+            result = less * along + wide(2.0) * half * half * wp.cross(turn, along)
+        return vec3(scalar(result[0]), scalar(result[1]), scalar(result[2]))
+
     @wp.kernel(module=module)
     def propose(
         first: int,
@@ -125,19 +206,25 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
         inertial: wp.array(dtype=vec3),
+        body: wp.array(dtype=wp.int32),
+        center: wp.array(dtype=wp.vec3d),
+        turn: wp.array(dtype=wp.vec3d),
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
         moved_out: wp.array(dtype=scalar),
         force_out: wp.array(dtype=scalar),
         scale_out: wp.array(dtype=scalar),
     ):
-        """x~ = x + p; how far each free vertex wants to go, and the forces on it. What is no number stays, infinitely far from its goal."""
+        """x~ = x + p, and what makes the rotation of whole bodies one that does not stretch them; how far each free vertex wants to go, and the forces on it. What is no number stays, infinitely far from its goal."""
         i = first + wp.tid()
         step = p[i]
         moved = wp.length(step)
         if not (moved < scalar(1.0e30)):
             moved = scalar(wp.inf)
             step = vec3()
+        b = body[i]
+        if b >= 0 and moved < scalar(wp.inf):
+            step += curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)])
         u_tilde_out[i] = u[i] + step
         x_tilde_out[i] = base[i] + (u[i] + step)
         moved_out[i] = moved
@@ -236,12 +323,15 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
+        center: wp.array(dtype=wp.vec3d),
+        turn: wp.array(dtype=wp.vec3d),
         fraction: wp.array(dtype=scalar),
         u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
         passes_out: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
+        """A part of the step, and of the rotation of the body: where on the arc, not on its chord."""
         i = first + wp.tid()
         if i == 0:
             passes_out[0] = 1  # what is not shortened has been proven already
@@ -255,7 +345,9 @@ def kernels(real: Real) -> SimpleNamespace:
             if attempts[0] >= HALVINGS:
                 f = scalar(0.0)
             fraction[i] = f
-            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i])
+            arm = widened(base[i] + u[i]) - center[b]
+            arc = curved(arm, wide(f) * turn[b]) - f * curved(arm, turn[b])
+            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i]) + arc
             x_end_out[i] = base[i] + u_end_out[i]
 
     @wp.kernel(module=module)
@@ -331,13 +423,15 @@ def kernels(real: Real) -> SimpleNamespace:
         renew_out: wp.array(dtype=wp.int32),
     ):
         """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads. Elastic
-        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last.
+        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last, and they
+        are exact: a projected one, or one from where a body was stretched by what rotated it, is too stiff to tell how much is left.
         """
+        was_projected = project_out[0] != 0
         project_out[0] = 1
         renew = int(1)
         if count[status.OUTER] > 0 and hits[0] == 0 and attempts[0] == 1:
             project_out[0] = 0
-            if renew_out[0] == 1 and numbers[status.MOVED] <= scalar(KEEP) * tolerance:
+            if renew_out[0] == 1 and not was_projected and numbers[status.MOVED] <= scalar(KEEP) * tolerance:
                 renew = int(0)
         renew_out[0] = renew
 
@@ -373,6 +467,7 @@ def kernels(real: Real) -> SimpleNamespace:
         hits: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         crowded: wp.array(dtype=wp.int32),
+        projected: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
         tolerance: scalar,
@@ -410,6 +505,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if driven:
                 count[status.DRIVEN] = count[status.DRIVEN] + 1
+            if projected[0] != 0:
+                left = left / scalar(EXACT)
             settled = left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
@@ -472,11 +569,21 @@ class Newton:
         work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
         simulated = [body for body in assembly.bodies if not body.kinematic]
         ranges = [(body.first, body.last) for body in simulated]
-        joined = np.array(
-            [(assembly.body_of_vertex[a.vertices_a[0]], assembly.body_of_vertex[a.vertices_b[0]]) for a in assembly.attachments]
-        ).reshape(-1, 2)
         inside = assembly.body_of_vertex < len(simulated)
-        pinned = np.flatnonzero(inside & ~free)
+        ties = np.concatenate(
+            [np.zeros((0, 2), dtype=np.int32)] + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+        )
+        both = inside[ties].all(axis=1)
+        joined = np.unique(assembly.body_of_vertex[ties[both]], axis=0)
+        held_vertices = np.flatnonzero(inside & ~free)
+        to_obstacles = np.concatenate([ties[~both], ties[~both][:, ::-1]])
+        to_obstacles = to_obstacles[~inside[to_obstacles[:, 0]] & inside[to_obstacles[:, 1]]]
+        pinned = np.column_stack(
+            [
+                np.concatenate([held_vertices, to_obstacles[:, 0]]),
+                assembly.body_of_vertex[np.concatenate([held_vertices, to_obstacles[:, 1]])],
+            ]
+        )
         self.islands = Islands(device, real, n, ranges, joined, pinned)
         work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
         work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
@@ -494,11 +601,13 @@ class Newton:
             return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=device.warp)
 
         self.starts, self.ends = upload([low for low, _ in ranges]), upload([high for _, high in ranges])
+        self.whole = upload([free[low:high].all() for low, high in ranges])
         vec3, scalar = real.vec3, real.scalar
         self.inertial, self.rhs, self.p = zeros(vec3), zeros(vec3), zeros(vec3, n + 1)
         self.inertial_energy, self.vertex_energy = zeros(wp.float64), zeros(wp.float64)
         self.moved, self.forces, self.scales, self.lags = (zeros(scalar) for _ in range(4))
         self.numbers = zeros(scalar, status.NUMBERS)
+        self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after = zeros(wp.float64, self.bodies), zeros(wp.float64, self.bodies)
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
@@ -595,7 +704,10 @@ class Newton:
         device.when(self.renew, self._assemble)
         self._solve_linear()
         device.when(self.solver.indefinite, self._solve_projected)
-        inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial]
+        if self.bodies:
+            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p, self.center, self.turn]
+            device.launch(k.find_turn, self.bodies, inputs, grain=SAMPLES)
+        inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial, self.islands.body, self.center, self.turn]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
         self.largest.max(self.moved, self.numbers, status.MOVED)
         self.largest.max(self.forces, self.numbers, status.FORCE)
@@ -670,7 +782,7 @@ class Newton:
                 device.launch(k.least_fraction, self.bodies, inputs, grain=1000)
                 device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
             which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
-            motion = [w.x_start, w.u, w.u_tilde, t.fraction, t.u_end, t.x_end, t.passes, t.going]
+            motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
             device.launch(k.turn_back, n, [*which, *motion])
             w.candidates.check(w.x, t.x_end)
             device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, t.x_end))
@@ -689,7 +801,7 @@ class Newton:
             inputs = [p.count, p.quads, model.free, p.gaps, p.activation, w.u, w.x_start, w.target]
             device.launch(k.crowd, p.capacity, [*inputs, self.crowded])
         s = model.settings
-        states = [self.pairs.count, self.hits, self.attempts, self.crowded, w.candidates.overflow, w.clock]
+        states = [self.pairs.count, self.hits, self.attempts, self.crowded, self.project, w.candidates.overflow, w.clock]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
         device.launch_serial(k.decide, [*states, *limits, self.numbers, self.drive, self.lagging, w.count, w.going])
 

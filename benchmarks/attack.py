@@ -1,0 +1,459 @@
+"""An attack on the guarantee: `python benchmarks/attack.py [--scenes N] [--seed S] [--minutes M] [--family NAME ...]`.
+
+Small scenes of families that are made to break it, with every solver, both methods, both precisions and every culling. Every motion that
+an outer iteration commits is judged by brute force over all pairs, in exact arithmetic where rounding leaves a doubt
+(tests/collision/exact.py), and every state by the witness; motions must follow one another without a break. A breach is printed with the
+scene's family and number, from which `--family NAME --only NUMBER` makes it again.
+
+It must end with "breaches: 0". Scenes that are refused are counted, not judged. Writes benchmarks/results/attack.json.
+"""
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(REPOSITORY / "tests"), str(REPOSITORY / "benchmarks")]
+
+from ccd import machine  # noqa: E402
+from collision import exact  # noqa: E402
+
+import pdipc  # noqa: E402
+
+STEPS, SECONDS, MOTIONS = 10, 6.0, 60  # of a scene, at most
+SOLVERS = ("auto", "pcg", "two-level", "jacobi", "chebyshev", "matrix-powers", "gauss-seidel", "sor", "direct")
+
+
+# --- what scenes are made of ---
+
+
+def sheet(name: str, side: float = 1.0, cells: int = 4, **more) -> dict:
+    return {"name": name, "kind": "cloth", "mesh": {"shape": "grid", "size": [side, side], "cells": [cells, cells]}, **more}
+
+
+def block(name: str, side: float = 0.3, cells: int = 1, young: float = 1e5, **more) -> dict:
+    mesh = {"shape": "box", "size": [side] * 3, "cells": [cells] * 3}
+    return {"name": name, "kind": "solid", "mesh": mesh, "material": {"young_modulus": young}, **more}
+
+
+def ball(name: str, radius: float, cells: int = 2, **more) -> dict:
+    return {"name": name, "mesh": {"shape": "sphere", "radius": radius, "cells": cells}, **more}
+
+
+def loose(name: str, vertices, triangles, **more) -> dict:
+    return {"name": name, "mesh": {"vertices": np.asarray(vertices, float), "triangles": np.asarray(triangles)}, **more}
+
+
+def power(rng, low: float, high: float) -> float:
+    return float(10.0 ** rng.uniform(low, high))
+
+
+def turn(rng, most: float = 180.0) -> list[float]:
+    return rng.uniform(-most, most, 3).tolist()
+
+
+def vector(rng, size: float) -> list[float]:
+    v = rng.normal(size=3)
+    return (size * v / np.linalg.norm(v)).tolist()
+
+
+# --- families: f(rng) -> (bodies, obstacles, simulation, contact), of which any but the first may be empty ---
+
+
+def far_from_origin(rng):
+    single = rng.random() < 0.4
+    place = np.array(vector(rng, power(rng, 1, 3) if single else power(rng, 2, 8)))
+    bodies = [
+        sheet("cloth", translation=(place + np.array([0, 0.32, 0])).tolist(), rotation=turn(rng, 10), velocity=vector(rng, 3))
+    ]
+    d = 2e-2 if single else max(2e-3, 1e-7 * np.linalg.norm(place))
+    contact = {"activation_distance": d}
+    return bodies, [ball("ball", 0.25, translation=place.tolist())], {"precision": "float32" if single else "float64"}, contact
+
+
+def millimetres_to_kilometres(rng):
+    s = power(rng, -4, 4)
+    bodies = [
+        block("block", 0.3 * s, translation=[0, 0.3 * s, 0], velocity=vector(rng, 3 * s), rotation=turn(rng)),
+        sheet("cloth", s, translation=[0, 0.8 * s, 0], velocity=[0, -10 * s * rng.random(), 0], rotation=turn(rng, 10)),
+    ]
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 4 * s}, "translation": [0, -0.05 * s, 0]}
+    return bodies, [floor], {"gravity": [0, -9.81 * s, 0]}, {"activation_distance": s * power(rng, -5, -1.5)}
+
+
+def strip(rng, length: float, width: float, count: int):
+    """A ribbon of needles: vertices on two long rails, in a random order along them."""
+    x = np.sort(rng.uniform(-length / 2, length / 2, count))
+    vertices = np.array([[a, 0, width * (k % 2)] for k, a in enumerate(x)])
+    return vertices, np.array([[k, k + 1, k + 2] if k % 2 else [k + 1, k, k + 2] for k in range(count - 2)])
+
+
+def needles(rng):
+    width = power(rng, -5, -1)
+    bodies = []
+    for k in range(3):
+        body = loose(f"ribbon{k}", *strip(rng, 1.0, width, 7), kind="cloth", rotation=turn(rng), velocity=vector(rng, 2))
+        bodies.append({**body, "translation": [0, 0.4 * k, 0]})
+    obstacle = loose("rail", *strip(rng, 2.0, width, 5), rotation=turn(rng), translation=[0, -0.4, 0])
+    return bodies, [obstacle], {"gravity": vector(rng, 20)}, {"activation_distance": power(rng, -4, -2)}
+
+
+def ridges(rng):
+    """Two roofs whose ridges are nearly parallel, one sinking on the other."""
+    angle, d = (
+        (power(rng, -6.2, -4.5), power(rng, -6.4, -5.5)) if rng.random() < 0.8 else (power(rng, -9, -2), power(rng, -6, -3))
+    )
+    triangles = [[0, 1, 2], [1, 0, 3]]
+
+    def off():
+        return float(rng.uniform(-0.2, 0.2))
+
+    lower = np.array([[-1 + off(), 0, 0], [1 + off(), 0, 0], [off(), -0.5, 0.5], [off(), -0.5, -0.5]])
+    a, b = -1 + off(), 1 + off()
+    beside = np.array([0, 3 * d, angle * rng.choice([0.0, off()])])  # the ridges cross here, or a little off the middle
+    upper = np.array([[a, 0, angle * a], [b, 0, angle * b], [off(), 0.5, 0.5], [off(), 0.5, -0.5]]) + beside
+    q = Rotation.from_euler("xyz", turn(rng), degrees=True).as_matrix()
+    h = power(rng, -5, -2)
+    speed = d * rng.uniform(0.2, 2) / h
+    body = loose("upper", upper @ q.T, triangles, kind="cloth", velocity=(q @ [0, -speed, 0]).tolist())
+    simulation = {"gravity": [0, 0, 0], "time_step": h, "precision": "float64"}
+    return [body], [loose("lower", lower @ q.T, triangles)], simulation, {"activation_distance": d}
+
+
+def coplanar_stacks(rng):
+    """Sheets with the same grid right above each other, pressed by a plate; every edge is parallel to many."""
+    gap, count = power(rng, -3, -1.5), int(rng.integers(2, 5))
+    turned = [0.0, float(rng.choice([0, 0, 90, 45])), 0.0]
+    bodies = [
+        sheet(f"sheet{k}", cells=2, translation=[0, k * gap, 0], rotation=turned if k % 2 else [0, 0, 0]) for k in range(count)
+    ]
+    plate = {"name": "plate", "mesh": {"shape": "plane", "size": 2.0}, "rotation": [180, 0, 0]}
+    plate |= {"translation": [0, count * gap, 0], "motion": {"velocity": [0, -gap * power(rng, 0, 3), 0]}}
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 2.0}, "translation": [0, -gap, 0]}
+    return bodies, [plate, floor], {}, {"activation_distance": gap * rng.uniform(0.1, 0.9)}
+
+
+def jumping_keyframes(rng):
+    """An obstacle that is somewhere else, turned, from one step to the next."""
+    steps = [{"time": 0.0}]
+    for k in range(3):
+        steps.append({"time": 0.02 * (k + 1), "translation": vector(rng, power(rng, -1, 3)), "rotation": turn(rng, 720)})
+    bar = {"name": "bar", "mesh": {"shape": "box", "size": [1.5, 0.05, 0.05], "cells": [1, 1, 1]}, "translation": [0, -0.1, 0]}
+    bodies = [sheet("cloth", translation=[0, 0.02, 0]), block("block", translation=[0, 0.4, 0])]
+    return bodies, [bar | {"motion": {"keyframes": steps}}], {}, {}
+
+
+def spinning_obstacles(rng):
+    spin = vector(rng, rng.choice([np.pi, 2 * np.pi, power(rng, 0, 3) * 0.01]) / 0.01)
+    bar = {
+        "name": "bar",
+        "mesh": {"shape": "box", "size": [1.2, 0.05, 0.05], "cells": [1, 1, 1]},
+        "motion": {"angular_velocity": spin},
+    }
+    bodies = [sheet("cloth", translation=[0, 0.1, 0]), block("block", translation=[0.3, 0.35, 0])]
+    return bodies, [bar], {"time_step": 0.01}, {"friction": 0.5}
+
+
+def knots(rng):
+    """Two linked rings whose far ends are led apart, faster than they can go."""
+    rings = []
+    for k, side in enumerate((-1.0, 1.0)):
+        mesh = {"shape": "torus", "major_radius": 0.3, "minor_radius": 0.06, "cells": [2, 9]}
+        rings.append({"name": f"ring{k}", "kind": "solid", "mesh": mesh, "material": {"young_modulus": 1e5}})
+        rings[k] |= {"translation": [0.15 * side, 0, 0], "rotation": [90.0 * k, 0, 0]}
+    pull = power(rng, 0, 4)
+    for ring, side in zip(rings, (-1.0, 1.0), strict=True):
+        box = [[-2, -2, -2], [-0.35, 2, 2]] if side < 0 else [[0.35, -2, -2], [2, 2, 2]]
+        ring["pins"] = [{"select": {"box": box}, "motion": {"velocity": [side * pull, 0, 0]}}]
+    return rings, [], {"gravity": [0, 0, 0]}, {"activation_distance": 5e-3}
+
+
+def jammed_plates(rng):
+    """Plates that close on bodies until they would be in one place."""
+    speed = power(rng, 0, 3)
+    plates = []
+    for k, side in enumerate((-1.0, 1.0)):
+        plate = {"name": f"plate{k}", "mesh": {"shape": "box", "size": [1, 0.1, 1], "cells": [1, 1, 1]}}
+        plates.append(plate | {"translation": [0, 0.3 * side, 0], "motion": {"velocity": [0, -side * speed, 0]}})
+    bodies = [block("block", 0.2, 2, young=power(rng, 3, 7)), sheet("cloth", 0.8, translation=[0, 0.15, 0])]
+    return bodies, plates, {}, {"friction": float(rng.choice([0, 0.5]))}
+
+
+def thick_cloth(rng):
+    """A minimum separation near the length of an edge, and gaps that are hardly more."""
+    thick = power(rng, -2.5, -0.8)
+    bodies = [sheet(f"sheet{k}", translation=[0, 1.02 * k * thick, 0], velocity=[0, -5.0 * k, 0]) for k in range(3)]
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 3.0}, "translation": [0, -1.02 * thick, 0]}
+    contact = {"minimum_separation": thick, "activation_distance": thick * power(rng, -2, 0)}
+    return bodies, [floor], {}, contact
+
+
+def tiny_beside_huge(rng):
+    tiny = power(rng, -3, -1)
+    bodies = [
+        block(
+            f"crumb{k}",
+            tiny,
+            translation=[0.7 * tiny * k, tiny * (0.6 + 1.3 * k), 0],
+            rotation=turn(rng, 5),
+            velocity=vector(rng, 1),
+        )
+        for k in range(3)
+    ]
+    huge = power(rng, 1, 4)
+    ground = loose("ground", [[-huge, 0, -huge], [huge, 0, -0.9 * huge], [0.1, 0, huge]], [[0, 2, 1]], rotation=turn(rng, 0.1))
+    return bodies, [ground], {}, {"activation_distance": tiny * power(rng, -2, -1)}
+
+
+def slivers(rng):
+    """Obstacles of thin triangles that fan out from a point, under a cloth."""
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
+    angles[1::2] = angles[::2][: len(angles[1::2])] + 10.0 ** rng.uniform(-6, -2, len(angles[1::2]))
+    rim = np.stack([np.cos(angles), 0.1 * rng.normal(size=9), np.sin(angles)], axis=1)
+    fan = [[0, k + 1, k + 2] for k in range(0, 8, 2)]
+    vertices = np.concatenate([[[0, 0.1, 0]], rim])
+    used = np.unique(fan)
+    triangles = np.searchsorted(used, fan)
+    bodies = [sheet("cloth", translation=[0, 0.45, 0], velocity=[0, -power(rng, 0, 2), 0], rotation=turn(rng, 20))]
+    return bodies, [loose("fan", vertices[used], triangles)], {}, {"activation_distance": power(rng, -4, -2)}
+
+
+def fast(rng):
+    speed = power(rng, 1, 6)
+    bodies = [
+        sheet("cloth", pins=[{"select": {"box": [[-0.51, -1, -1], [-0.49, 1, 1]]}}]),
+        block("bullet", 0.05, translation=[0.1, 0.3, 0.07], velocity=[0, -speed, 0], rotation=turn(rng)),
+        block("other", 0.05, translation=[-0.2, -0.3, 0.1], velocity=[0, speed, 0], angular_velocity=vector(rng, 100)),
+    ]
+    return bodies, [], {}, {}
+
+
+def pins_led_away(rng):
+    """A cloth of which one side is led far away within a few steps."""
+    far, single = power(rng, 4, 6.5) if rng.random() < 0.7 else power(rng, 0, 4), rng.random() < 0.5
+    pins = []
+    for at, place, turned in ((-0.5, [0, 0, 0], [0, 0, 0]), (0.5, vector(rng, far), turn(rng))):
+        keys = [{"time": 0.0}, {"time": 0.02, "translation": place, "rotation": turned}]
+        pins.append({"select": {"box": [[-0.51, -1, at - 0.01], [0.51, 1, at + 0.01]]}, "motion": {"keyframes": keys}})
+    simulation = {"precision": "float32" if single else "float64", "time_step": 0.01, "max_outer": int(rng.choice([5, 20]))}
+    return [sheet("cloth", cells=6, pins=pins)], [], simulation, {}
+
+
+def spikes(rng):
+    """A cone with a sharp tip under a vertex, an edge or the middle of a face, and a cloth that falls on it."""
+    height = rng.uniform(0.2, 0.5)
+    tip = [float(rng.choice([0, 0.125, 0.1])), height, float(rng.choice([0, 0.125, 0.07]))]
+    width = power(rng, -4, -1)
+    base = [[width * np.cos(a), 0, width * np.sin(a)] for a in (0, 2, 4)]
+    cone = loose("spike", [*base, tip], [[0, 3, 1], [1, 3, 2], [2, 3, 0], [0, 1, 2]])
+    bodies = [sheet("cloth", translation=[0, height + 0.02, 0], velocity=[0, -power(rng, 0, 3), 0])]
+    return bodies, [cone], {}, {"activation_distance": power(rng, -4, -2)}
+
+
+def aligned_grids(rng):
+    """Vertex above vertex, edge above edge: everything degenerate at once, with round numbers."""
+    h = float(rng.choice([0.25, 0.125]))
+    bodies = [
+        sheet("lower", cells=4, translation=[0, 0, 0]),
+        block("upper", 0.5, 2, translation=[0, 0.25 + h, 0], velocity=[0, -16, 0]),
+    ]
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 2.0}, "translation": [0, -0.125, 0]}
+    return bodies, [floor], {"gravity": [0, -8, 0], "time_step": 0.0078125}, {"activation_distance": 0.015625}
+
+
+def whirling_bodies(rng):
+    bodies = [
+        block("a", 0.3, rotation=turn(rng), angular_velocity=vector(rng, power(rng, 1, 4))),
+        sheet("b", 0.6, translation=[0.4, 0.3, 0], angular_velocity=vector(rng, power(rng, 0, 3)), rotation=turn(rng)),
+        sheet("c", 0.6, 3, translation=[-0.5, 0, 0.3], velocity=[5, 0, 0], rotation=turn(rng)),
+    ]
+    return bodies, [], {}, {"restitution": float(rng.choice([0, 0.7]))}
+
+
+FAMILIES = (
+    far_from_origin,
+    millimetres_to_kilometres,
+    needles,
+    ridges,
+    coplanar_stacks,
+    jumping_keyframes,
+    spinning_obstacles,
+    knots,
+    jammed_plates,
+    thick_cloth,
+    tiny_beside_huge,
+    slivers,
+    fast,
+    pins_led_away,
+    spikes,
+    aligned_grids,
+    whirling_bodies,
+)
+
+
+def make(family, number: int, seed: int) -> tuple[pdipc.Scene, str]:
+    """Scene `number` of a family, and its settings in words."""
+    rng = np.random.default_rng([seed, FAMILIES.index(family), number])
+    bodies, obstacles, simulation, contact = family(rng)
+    method = str(rng.choice(["barrier"] * 4 + ["paper"]))
+    common = {
+        "precision": str(rng.choice(["float64", "float32"])),
+        "max_outer": int(rng.choice([1, 2, 5, 12])),
+        "time_step": float(rng.choice([0.001, 0.01, 0.04])),
+    }
+    if method == "barrier" and rng.random() < 0.6:
+        common |= {"nonlinear_solver": "newton"}
+    else:
+        common |= {"linear_solver": "a-jacobi" if method == "paper" and rng.random() < 0.5 else str(rng.choice(SOLVERS))}
+        common |= {"inner_iterations": int(rng.choice([2, 10, 30]))}
+    kept = {
+        "method": method,
+        "broad_phase": str(rng.choice(["patches", "bvh"])),
+        "truncation": str(rng.choice(["auto", "per_vertex", "global"])),
+    }
+    simulation, contact = common | simulation, kept | contact
+    words = " ".join(f"{key}={value}" for key, value in (simulation | contact).items())
+    return pdipc.Scene(bodies=bodies, obstacles=obstacles, simulation=simulation, contact=contact), words
+
+
+# --- the judge ---
+
+
+class Judge:
+    """Sees every motion that is committed; `breaches` says what went wrong."""
+
+    def __init__(self, simulation: pdipc.Simulation):
+        triangles, assembly = simulation.triangles, simulation.model.assembly
+        self.obstacle, self.last, self.breaches = assembly.obstacle, simulation.positions.copy(), []
+        self.motions = self.pairs = 0
+        edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        vertices = np.unique(triangles)
+        i, j = np.triu_indices(len(edges), 1)
+        self.quads = {
+            "vertex_triangle": np.column_stack([np.repeat(vertices, len(triangles)), np.tile(triangles, (len(vertices), 1))]),
+            "edge_edge": np.column_stack([edges[i], edges[j]]),
+        }
+        for kind, split in (("vertex_triangle", 1), ("edge_edge", 2)):
+            quads = self.quads[kind]
+            shared = (quads[:, :split, None] == quads[:, None, split:]).any(axis=(1, 2))
+            self.quads[kind] = quads[~shared & ~self.obstacle[quads].all(axis=1)]
+
+    def __call__(self, begin, end) -> None:
+        x, y = begin.numpy().astype(float), end.numpy().astype(float)
+        self.motions += 1
+        if not np.array_equal(x, self.last):
+            self.breaches.append(f"motion {self.motions} does not begin where the last one ended")
+        self.last = y
+        if not np.isfinite(y).all():
+            self.breaches.append(f"motion {self.motions} ends at what is not finite")
+            return
+        low, high = np.minimum(x, y), np.maximum(x, y)
+        for (kind, quads), split in zip(self.quads.items(), (1, 2), strict=True):
+            a, b = quads[:, :split], quads[:, split:]
+            near = np.ones(len(quads), dtype=bool)
+            for axis in range(3):
+                near &= low[a, axis].min(axis=1) <= high[b, axis].max(axis=1)
+                near &= high[a, axis].max(axis=1) >= low[b, axis].min(axis=1)
+            chosen = quads[near]
+            self.pairs += len(chosen)
+            if len(chosen):
+                points = np.concatenate([x[chosen], y[chosen]], axis=1)
+                apart = exact.stays_apart(points, kind, np.ones(len(chosen)))
+                for quad in chosen[~apart][:3]:
+                    self.breaches.append(f"motion {self.motions}: {kind} {quad.tolist()} meets")
+
+
+def attack(family, number: int, seed: int) -> dict:
+    """Runs one scene; what came of it."""
+    scene, words = make(family, number, seed)
+    outcome = {"family": family.__name__, "number": number, "settings": words, "refused": "", "breaches": [], "steps": 0}
+    outcome |= {"motions": 0, "pairs": 0, "seconds": 0.0}
+    begun = time.perf_counter()
+    try:
+        simulation = pdipc.Simulation(scene, "cpu")
+    except pdipc.SceneError as error:
+        return outcome | {"refused": str(error)}
+    judge = simulation.observe = Judge(simulation)
+    for _ in range(STEPS):
+        simulation.step()
+        outcome["steps"] += 1
+        meets = pdipc.find_intersections(simulation.positions, simulation.triangles, judge.obstacle)
+        if len(meets):
+            judge.breaches.append(f"step {outcome['steps']}: triangles {meets[0].tolist()} intersect, of {len(meets)} pairs")
+        if judge.breaches or judge.motions >= MOTIONS or time.perf_counter() - begun > SECONDS:
+            break
+    seconds = time.perf_counter() - begun
+    return outcome | {"breaches": judge.breaches, "motions": judge.motions, "pairs": judge.pairs, "seconds": seconds}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=1000, help="scenes that are run, not counting refused ones")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=90.0)
+    parser.add_argument("--family", action="append", choices=[family.__name__ for family in FAMILIES])
+    parser.add_argument("--only", type=int, help="this number of each family alone")
+    parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "attack.json")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    families = [family for family in FAMILIES if not options.family or family.__name__ in options.family]
+    rows = defaultdict(lambda: {"scenes": 0, "refused": 0, "steps": 0, "motions": 0, "pairs": 0, "breaches": 0, "errors": 0})
+    wrong, run, begun = [], 0, time.perf_counter()
+    number = options.only or 0
+    while run < options.scenes and time.perf_counter() - begun < 60 * options.minutes:
+        for family in families:
+            row = rows[family.__name__]
+            try:
+                outcome = attack(family, number, options.seed)
+            except Exception as error:
+                row["errors"] += 1
+                wrong.append({"family": family.__name__, "number": number, "error": f"{type(error).__name__}: {error}"})
+                print("ERROR", json.dumps(wrong[-1]), flush=True)
+                continue
+            if outcome["refused"]:
+                row["refused"] += 1
+                if options.only is not None:
+                    print(outcome["refused"])
+                continue
+            run += 1
+            row["scenes"] += 1
+            for key in ("steps", "motions", "pairs"):
+                row[key] += outcome[key]
+            if outcome["breaches"]:
+                row["breaches"] += 1
+                wrong.append(outcome)
+                print("BREACH", json.dumps(outcome), flush=True)
+            elif options.only is not None:
+                print(json.dumps(outcome))
+        number += 1
+        seconds = time.perf_counter() - begun
+        print(f"{run} scenes in {seconds:.0f} s, breaches: {sum(row['breaches'] for row in rows.values())}", flush=True)
+        if options.only is not None:
+            return int(bool(wrong))
+    for name, row in rows.items():
+        print(f"{name:26}", "  ".join(f"{value:,} {key}" for key, value in row.items()))
+    total = {
+        key: sum(row[key] for row in rows.values())
+        for key in ("scenes", "refused", "steps", "motions", "pairs", "breaches", "errors")
+    }
+    result = {
+        "machine": machine(),
+        "seed": options.seed,
+        "seconds": round(seconds),
+        **total,
+        "families": rows,
+        "wrong": wrong[:50],
+    }
+    options.output.write_text(json.dumps(result, indent=1) + "\n")
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
