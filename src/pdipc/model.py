@@ -145,11 +145,6 @@ class Model:
         return bool((self.friction.numpy() > 0.0).any())
 
     @property
-    def scripted_vertices(self) -> bool:
-        """Whether anything follows a script, an obstacle or a pin, at rest or moving."""
-        return self.moves
-
-    @property
     def recordable(self) -> bool:
         """Whether a step can be one graph."""
         return self.solver is None or self.solver.recordable

@@ -760,7 +760,7 @@ class Newton:
         device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts])
         self.islands.find(w.candidates)
         device.launch_serial(k.clear_motion, [w.count])
-        if model.scripted_vertices:
+        if model.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
         self._evaluate(t.u_end, t.x_end)
@@ -796,7 +796,7 @@ class Newton:
         self.largest.max(self.lags, self.numbers, status.LAG)
         self._keep_energies()
         device.launch_serial(k.clear_flag, [self.crowded])
-        if model.scripted_vertices:
+        if model.moves:
             p = self.pairs
             inputs = [p.count, p.quads, model.free, p.gaps, p.activation, w.u, w.x_start, w.target]
             device.launch(k.crowd, p.capacity, [*inputs, self.crowded])
