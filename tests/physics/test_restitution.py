@@ -46,7 +46,11 @@ def rebound(body, half, *, eps, speed, time_step, phase, method="barrier", after
     gap = 0.003 + (2.0 + phase) * speed * time_step
     body = {**body, "translation": (0, half + gap, 0), "velocity": (0, -speed, 0)}
     contact = {"method": method, "restitution": eps, "activation_distance": 1e-3}
-    simulation = {"time_step": time_step, "gravity": (0, 0, 0), "tolerance": 1e-4}  # energy and eps hold as far as steps converge
+    simulation = {
+        "time_step": time_step,
+        "gravity": (0, 0, 0),
+        "tolerance": 1e-4,
+    }  # energy and eps hold as far as steps converge
     made = pdipc.Simulation(scene([body], [floor(2.0)], contact=contact, **simulation), "cpu")
     made.observe = Witness(made)
     energies = [motion(made)[2]]
