@@ -38,6 +38,8 @@ class Audit:
 def audit(model: Model, state: State, work: Work) -> Audit:
     """The energies and momenta of `state`."""
     work.list_pairs(state.positions)
+    if model.projector.cavities is not None:
+        model.projector.cavities.reference.zero_()
     numbers = wp.zeros(2, dtype=model.real.scalar, device=model.device.warp)
     model.projector.energy(state.positions, state.remainders, numbers, 0)
     work.pairs.energy(numbers, 1)

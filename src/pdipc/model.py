@@ -8,22 +8,17 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from pdipc import constraints
+from pdipc import cloth, constraints
 from pdipc.collision import surface
 from pdipc.constraints import (
     corotated,
-    curved_bending,
     edge_length,
     material,
     neo_hookean,
     point_attachment,
-    quadratic_bending,
     tet_strain,
     tet_volume,
     tets,
-    triangle_area,
-    triangle_strain,
-    triangles,
 )
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
@@ -176,11 +171,13 @@ class Model:
         vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
         return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
 
-    def move_anchors(self, time: float) -> None:
-        """Uploads where the points of soft pins are at `time`."""
+    def set_time(self, time: float) -> None:
+        """Uploads what a script says of `time`, s: where the points of soft pins are, and what closed sheets hold."""
         soft = [pin for pin in self.assembly.pins if pin.stiffness is not None and len(pin.vertices)]
         if self.projector.anchors is not None:
             self.projector.anchors.assign(np.concatenate([self.assembly.pin_targets(pin, time) for pin in soft]))
+        if self.projector.cavities is not None:
+            self.projector.cavities.laws.assign(self._fillings.laws(time))
 
     @functools.cached_property
     def moves(self) -> bool:
@@ -188,6 +185,15 @@ class Model:
         a = self.assembly
         scripted = [body.trajectory for body in a.bodies if body.trajectory] + [pin.trajectory for pin in a.pins]
         return any(not trajectory.is_static for trajectory in scripted)
+
+    @functools.cached_property
+    def _fillings(self) -> cloth.Fillings:
+        return cloth.Fillings(self.assembly)
+
+    @functools.cached_property
+    def changes(self) -> bool:
+        """Whether anything that acts on bodies changes with time by a script."""
+        return self.moves or any(body.inside is not None for body in self.assembly.bodies)
 
     def kinematic_targets(self, time: float) -> np.ndarray:
         """(n, 3) m: where the kinematic vertices are at `time`; the start for all others."""
@@ -343,18 +349,9 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
                 sets.append(kind.rest(x, body.tets, 0.5 * strain, volume / 3.0))
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
         elif isinstance(m, ClothMaterial):
-            if m.membrane == "springs":
-                edges, stiffness = material.springs(x, body.triangles, m.membrane_stiffness)
-                sets.append(edge_length.rest(x, edges, stiffness))
-            else:
-                strain, area = material.cloth(m.membrane_stiffness, m.poisson_ratio)
-                sets.append(triangle_strain.rest(x, body.triangles, strain))
-                if area > 0.0:
-                    sets.append(triangle_area.rest(x, body.triangles, area))
-            bending = curved_bending if m.bending == "curved" else quadratic_bending
-            if m.bending_stiffness:
-                sets.append(bending.rest(x, body.triangles, m.bending_stiffness))
-            mass += material.lumped_mass(n, body.triangles, m.areal_density * triangles.rest_shape(x, body.triangles)[1])
+            own, its_mass = cloth.elasticity(assembly, body)
+            sets += own
+            mass += its_mass
     for pin in assembly.pins:
         if pin.stiffness is not None:
             sets.append(point_attachment.rest(assembly.pin_targets(pin, 0.0), pin.vertices, pin.stiffness))

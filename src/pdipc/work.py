@@ -83,9 +83,9 @@ class Work:
     def set_scripted(self, state: State, time: float) -> None:
         """Where kinematic vertices go by `time`, only uploaded where they move, and the external accelerations."""
         model = self.model
-        if not self._scripted or model.moves:
+        if not self._scripted or model.changes:
             self.target.assign(model.kinematic_targets(time))
-            model.move_anchors(time)
+            model.set_time(time)
         self.loads.update(state.time, state.positions, state.velocities)
         self._scripted = True
 

@@ -9,6 +9,7 @@ from pdipc.constraints import (
     corotated,
     curved_bending,
     edge_length,
+    enclosed_volume,
     material,
     neo_hookean,
     point_attachment,
@@ -49,6 +50,15 @@ def make(kind, rng):
     if kind in (corotated, neo_hookean):
         x, tets = tet_mesh(rng)
         return x, kind.rest(x, tets, 2.0, 3.0)
+    if kind is enclosed_volume:
+        x, tets = tet_mesh(rng)
+        surface = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 4], [1, 4, 3], [2, 3, 4]], dtype=np.int32)
+        cavity = enclosed_volume.cavities(surface)
+        volume = enclosed_volume.volumes(x, surface, cavity)
+        assert (cavity == 0).all() and volume[0] == pytest.approx(np.abs(tet_volume.rest(x, tets, 1.0).weight).sum())
+        return x, kind.rest(
+            surface, cavity, np.column_stack([0 * volume - 2.0, 0 * volume + 2.0, 0 * volume + 1.4, 0 * volume + 3.0, volume])
+        )
     if kind is point_attachment:
         x = rng.standard_normal((4, 3))
         return x, kind.rest(x[:3], np.arange(3), 2.0)

@@ -4,7 +4,7 @@ Solids. For small strains e, w V |F - R|^2 / 2 is w V e:e / 2, and w V |F - P|^2
 law has the energy V (mu e:e + lambda tr(e)^2 / 2). So tet_strain has w = 2 mu and tet_volume has w = 3 lambda.
 
 Cloth, in plane stress with Y = E t in N/m: triangle_strain has w = 2 mu', mu' = Y / (2 (1 + nu)), and triangle_area, where
-|F - P|^2 is tr(e)^2 / 2, has w = 2 lambda', lambda' = Y nu / (1 - nu^2).
+|F - P|^2 is tr(e)^2 / 2, has w = 2 lambda', lambda' = Y nu / (1 - nu^2). An area stiffness K of its own, K tr(e)^2 / 2, adds 2 K.
 """
 
 import numpy as np

@@ -10,6 +10,7 @@ from pdipc.constraints import (
     corotated,
     curved_bending,
     edge_length,
+    enclosed_volume,
     neo_hookean,
     point_attachment,
     quadratic_bending,
@@ -33,6 +34,7 @@ KINDS = (
     edge_length,
     quadratic_bending,
     curved_bending,
+    enclosed_volume,
     point_attachment,
 )
 
@@ -69,6 +71,7 @@ class Projector:
     sets: one a kind, elements in the order of the bodies. bending: those of them whose Hessian depends on the state, in the order in
     which their blocks are stored.
     anchors: the points of attachments, (k,) vec3, or None; assign to it to move the points.
+    cavities: what closed sheets hold, or None; a part of the Newton matrix as well.
     energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
     blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row.
     """
@@ -85,6 +88,7 @@ class Projector:
         self._batches = []
         self.bending: list[ConstraintSet] = []
         self.anchors: wp.array | None = None
+        self.cavities: enclosed_volume.Cavities | None = None
         slot = element = block = 0
         for s in self.sets:
             kind = known[s.kind]
@@ -92,6 +96,9 @@ class Projector:
             rest = kind.arguments(device, real, s)
             if kind is point_attachment:
                 self.anchors = rest[0]
+            if kind is enclosed_volume:
+                c = self.cavities = enclosed_volume.Cavities(device, real, n_vertices, s)
+                rest = [c.number, c.pressure, c.leader, c.first, c.energy]
             arrays = [wp.array(s.vertices, dtype=vector, device=device.warp), *rest]
             arrays.append(wp.array(s.weight, dtype=real.scalar, device=device.warp))
             kernels = kind.kernels(real)
@@ -123,12 +130,16 @@ class Projector:
 
         Every corner writes to a place of its own and every vertex gathers its own: no atomics. Recordable.
         """
+        if self.cavities is not None:
+            self.cavities.measure(base, u)
         for kind, count, arrays, slot, _, _ in self._batches:
             self.device.launch(kind.force, count, [*arrays, base, u, slot, self._corners], grain=16)
         self.device.launch(self._kernels.gather, self.n, [force, self._offsets, self._slots, self._corners, force_out], grain=8)
 
     def evaluate(self, base: wp.array, u: wp.array) -> None:
         """Fills `energies` at x = base + u. Recordable."""
+        if self.cavities is not None:
+            self.cavities.measure(base, u)
         for kind, count, arrays, _, element, _ in self._batches:
             self.device.launch(kind.energy, count, [*arrays, base, u, element, self.energies], grain=16)
 
@@ -142,6 +153,8 @@ class Projector:
         """Fills `blocks`: the Hessians at x = base + u; project: (1,) int32 on the device, whether each is to be positive semidefinite.
         Recordable.
         """
+        if self.cavities is not None:
+            self.cavities.differentiate(base, u)
         for kind, count, arrays, _, _, block in self._batches:
             if hasattr(kind, "hessian"):
                 self.device.launch(kind.hessian, count, [*arrays, base, u, block, project, self.blocks], grain=64)

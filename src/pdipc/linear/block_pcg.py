@@ -22,9 +22,9 @@ LOOSE = 10.0  # how much less exact a solve is that is far from the end
 
 
 class Coupling(Protocol):
-    """What contact adds to the matrix, low-rank terms pair by pair."""
+    """What is added to the matrix beside the blocks of elements: low-rank terms of pairs in contact, or of closed surfaces."""
 
-    diagonal: wp.array  # (n,) 3x3 blocks of the diagonal, kg/s^2
+    diagonal: wp.array | None  # (n,) 3x3 blocks of the diagonal, kg/s^2; None where the preconditioner does without
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """Launches y += (contact Hessian) p."""
@@ -63,20 +63,21 @@ class BlockPcg:
         self._kernels, self._pcg = kernels(real), pcg.kernels(real)
         self._advance = _advance_kernel(real)
 
-    def prepare(self, x: wp.array, contacts: list[Coupling]) -> None:
-        """Launches the preconditioner for the matrix and contacts as they are now, at the positions x."""
+    def prepare(self, x: wp.array, couplings: list[Coupling]) -> None:
+        """Launches the preconditioner for the matrix and couplings as they are now, at the positions x."""
         k = self._kernels
-        diagonals = [c.diagonal for c in contacts] + [None] * (2 - len(contacts))
+        diagonals = [c.diagonal for c in couplings if c.diagonal is not None]
+        diagonals += [None] * (2 - len(diagonals))
         inputs = [self._free, self.matrix.diagonal, *diagonals, self._inverse]
         self.device.launch(k.invert_diagonal, self.matrix.count, inputs, grain=32)
         if self.modes.groups:
-            self.modes.prepare(x, contacts)
+            self.modes.prepare(x, couplings)
 
     def solve(
         self,
         p: wp.array,
         b: wp.array,
-        contacts: list[Coupling],
+        couplings: list[Coupling],
         tolerated: float,
         loose: wp.array,
         tolerance: float | None = None,
@@ -91,7 +92,7 @@ class BlockPcg:
         status = [self._first, self._left, self.iterations, self._residual, self._going]
         limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
         self.device.launch(k.clear, m.count, [self._w])
-        for c in contacts:
+        for c in couplings:
             c.apply(p, self._w)
         self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
         self._precondition()
@@ -100,7 +101,7 @@ class BlockPcg:
         )
 
         def iterate() -> None:
-            for c in contacts:
+            for c in couplings:
                 c.apply(self._u, self._w)
             sums.launch(k.multiply, [*rows, self._free, self._u, self._w, self._partial])
             sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])

@@ -33,10 +33,10 @@ from pdipc.barrier.restitution import Restitution
 from pdipc.collision.islands import Islands
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
+from pdipc.device.sums import BodySums
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.nonlinear import status
-from pdipc.nonlinear.sums import BodySums
 
 FRICTION_LAGS = (
     12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
@@ -642,8 +642,9 @@ class Newton:
             self.friction.grow()
         return grown
 
-    def _contacts(self) -> list:
-        return [self.pairs] if self.friction is None else [self.pairs, self.friction]
+    def _couplings(self) -> list:
+        """What the matrix has beside the blocks of elements."""
+        return [each for each in (self.pairs, self.friction, self.model.projector.cavities) if each is not None]
 
     # Algorithm 1, in launches only.
 
@@ -655,6 +656,8 @@ class Newton:
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
             self.friction.lag()
+        if self.model.projector.cavities is not None:
+            self.model.projector.cavities.refer(w.x_start, w.u)
         self._evaluate(w.u, w.x)
         self._keep_energies()
 
@@ -715,10 +718,10 @@ class Newton:
 
     def _assemble(self) -> None:
         self.matrix.assemble(self.work.x_start, self.work.u, self.project)
-        self.solver.prepare(self.work.x, self._contacts())
+        self.solver.prepare(self.work.x, self._couplings())
 
     def _solve_linear(self) -> None:
-        contacts = self._contacts()
+        contacts = self._couplings()
         self.solver.solve(self.p, self.rhs, contacts, self.tolerated, self.project)
 
     def _solve_projected(self) -> None:
@@ -742,8 +745,9 @@ class Newton:
             n,
             [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
         )
-        self.solver.prepare(w.x, [self.pairs])
-        self.solver.solve(self.p, r.zero, [self.pairs], 0.0, self.still, REBOUND_TOLERANCE[model.real.name])
+        couplings = [each for each in self._couplings() if each is not self.friction]
+        self.solver.prepare(w.x, couplings)
+        self.solver.solve(self.p, r.zero, couplings, 0.0, self.still, REBOUND_TOLERANCE[model.real.name])
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
 

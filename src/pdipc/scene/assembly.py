@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from pdipc.scene import meshes
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
+from pdipc.scene.garments import Inside
 from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import Mesh
 from pdipc.scene.motion import Deforming, Trajectory, rotation_matrix
@@ -46,7 +47,7 @@ class AssembledBody:
 
     tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward.
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
-    trajectory: how an obstacle moves; None for bodies.
+    trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds.
     """
 
     name: str
@@ -59,6 +60,7 @@ class AssembledBody:
     half_separation: float
     friction: float
     trajectory: Trajectory | Deforming | None = None
+    inside: Inside | None = None
 
     @property
     def kinematic(self) -> bool:
@@ -356,6 +358,7 @@ def gather(
                 half_separation=0.0,
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
                 trajectory=deforming,
+                inside=placed.inside if isinstance(placed, Cloth) else None,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):

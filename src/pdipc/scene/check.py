@@ -1,7 +1,7 @@
 """What is refused before a simulation begins, with every finding at once."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,11 @@ from pdipc.judge import boxes
 from pdipc.judge.witness import find_intersections
 from pdipc.scene import meshes
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
+from pdipc.scene.check_garments import check_garments
 from pdipc.scene.errors import SceneError
+from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
-from pdipc.scene.schema import Scene, local_global_settings, uses_newton
+from pdipc.scene.schema import Cloth, Scene, local_global_settings, uses_newton
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -29,21 +31,6 @@ ACTIVATION_PART, ACTIVATION_ULPS = 1e-7, 10
 # distance and below some steps do not converge and vertices hang in the air, with 1e-5 and above all fall.
 CLOSEST_PART, CLOSEST_ULPS = 1e-5, 10
 REST_SEPARATION = 0.2  # that of `pdipc.collision.candidates`
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that must be put right. where: bodies or keys. found: what is wrong. right: what would be right, if that is not
-    in `found`. readable: False for what could not be read, or names what is not there; True for what was read and cannot be simulated.
-    """
-
-    where: str
-    found: str
-    right: str = ""
-    readable: bool = True
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.found}" + (f"; {self.right}" if self.right else "")
 
 
 def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding]:
@@ -121,6 +108,12 @@ def _settings(scene: Scene) -> Iterator[Finding]:
         if model in ("corotated", "neo_hookean") and not newton:
             found = f'is "{model}", which no local projection belongs to'
             yield Finding(f'body "{body.name}": material.model', found, 'take "arap", or the Newton solver')
+        if isinstance(body, Cloth) and body.inside is not None and not newton:
+            yield Finding(
+                f'body "{body.name}": inside',
+                "needs the Newton solver",
+                "leave it out, or take the barrier's contact and newton",
+            )
     aggregates = solver == "a-jacobi" or (solver == "auto" and method == "paper")
     if aggregates and method == "barrier":
         found = f'"{solver}" cannot take the contacts of contact.method = "{method}"'
@@ -159,6 +152,7 @@ def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Fi
         findings += _elements(assembly, body)
     findings += _selections(assembly)
     findings += _motions(assembly)
+    findings += check_garments(assembly)
     distances = [*_activation(assembly, precision), *_separation(assembly, precision)] if complete else []
     # what counts is where the simulation begins: rounding can bring two sides of a thin body into one place
     assembly = replace(assembly, positions=assembly.positions.astype(precision).astype(np.float64))
@@ -483,7 +477,10 @@ def _inside(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Find
     parts = [_components(body) for body in assembly.bodies]
     for i, outer in enumerate(assembly.bodies):
         corners = x[outer.triangles]
-        if not _is_closed(outer.triangles) or np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) <= 0:
+        if (
+            not meshes.is_closed(outer.triangles)
+            or np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) <= 0
+        ):
             continue
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         for j, inner in enumerate(assembly.bodies):
@@ -505,13 +502,6 @@ def _components(body: AssembledBody) -> np.ndarray:
     used = np.unique(body.triangles) - body.first
     _, label = connected_components(graph, directed=False)
     return used[np.unique(label[used], return_index=True)[1]] + body.first
-
-
-def _is_closed(triangles: np.ndarray) -> bool:
-    """Whether every edge is passed once in each direction."""
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    forward, backward = (np.unique(way, axis=0) for way in (sides, sides[:, ::-1]))
-    return len(forward) == len(sides) and np.array_equal(forward, backward)
 
 
 def winding_number(point: np.ndarray, corners: np.ndarray) -> float:

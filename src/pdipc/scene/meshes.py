@@ -87,6 +87,13 @@ def flat_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return triangle_areas(vertices, triangles) <= FLAT * longest_edges(vertices, triangles) ** 2
 
 
+def is_closed(triangles: np.ndarray) -> bool:
+    """Whether every edge is passed once in each direction."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forward, backward = (np.unique(way, axis=0) for way in (sides, sides[:, ::-1]))
+    return len(forward) == len(sides) and np.array_equal(forward, backward)
+
+
 def without_useless(mesh: Mesh, where: str, frames: Iterable[np.ndarray] = ()) -> Mesh:
     """A surface without the triangles that bound nothing: those without area, and repetitions of others; its notes say so.
 

@@ -9,14 +9,14 @@ import numpy as np
 from pydantic import BaseModel, Tag
 from pydantic.fields import FieldInfo
 
-from pdipc.scene import generators, schema
+from pdipc.scene import garments, generators, schema
 from pdipc.scene.load import bundled_scenes, load_scene
 from pdipc.scene.meshes import TET_SUFFIXES, TRIANGLE_SUFFIXES
 
 SECTIONS = {
     "The scene": (schema.Scene,),
     "Simulation and contact": (schema.Simulation, schema.Contact),
-    "Bodies": (schema.Solid, schema.SolidMaterial, schema.Cloth, schema.ClothMaterial, schema.Copies),
+    "Bodies": (schema.Solid, schema.SolidMaterial, schema.Cloth, schema.ClothMaterial, garments.Inside, schema.Copies),
     "Pins, selections, attachments": (schema.Pin, schema.Selection, schema.Attachment),
     "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe, schema.Deformation, schema.FrameArrays),
     "Forces": (schema.Wind, schema.VertexForce),

@@ -25,16 +25,12 @@ from pydantic import (
 
 from pdipc.scene import generators
 from pdipc.scene.explain import short
-from pdipc.scene.tables import Real, Table, Whole
+from pdipc.scene.garments import Inside
+from pdipc.scene.tables import Index, NotNegative, Number, Positive, Real, Table, Vector, Whole
 
 SHORTEST_STEP = 1e-9  # s
 
-Number = Annotated[Real, Field(allow_inf_nan=False)]
-Positive = Annotated[Real, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[Real, Field(ge=0, allow_inf_nan=False)]
-Index = Annotated[Whole, Field(ge=0)]
 Count = Annotated[Whole, Field(ge=1, le=10**9)]
-Vector = tuple[Number, Number, Number]
 
 
 def _no_instant(seconds: float) -> float:
@@ -360,6 +356,12 @@ class ClothMaterial(Table):
         default=None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
     )
     poisson_ratio: Real = Field(default=0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
+    area_stiffness: NotNegative = Field(
+        default=0.0,
+        le=1e9,
+        description="Of a resistance to changes of area, on top of what poisson_ratio gives, N/m: force per length over relative "
+        "change of area.",
+    )
     bending_stiffness: NotNegative | None = Field(
         default=None,
         le=1e6,
@@ -376,6 +378,8 @@ class ClothMaterial(Table):
     def _fill(self) -> "ClothMaterial":
         """Completes the stiffnesses, so that readers find numbers; what was given stays known in `model_fields_set`."""
         stretch, bend = self.membrane_stiffness, self.bending_stiffness
+        if self.membrane == "springs" and self.area_stiffness:
+            raise ValueError('area_stiffness has no effect on springs; take membrane = "strain"')
         if stretch is None or "membrane_stiffness" not in self.model_fields_set:
             stretch = (self.young_modulus or 1e5) * self.thickness
         elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, stretch, rtol=1e-6):
@@ -523,6 +527,9 @@ class Cloth(Body):
 
     kind: Literal["cloth"] = "cloth"
     material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
+    inside: Inside | None = Field(
+        default=None, description="What each closed part of it holds: a pressure, a gas or a liquid; needs the Newton solver."
+    )
 
 
 def _cache_kind(value: Any) -> str | None:

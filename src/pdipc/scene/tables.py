@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from pdipc.scene.errors import SceneError
 from pdipc.scene.explain import explain
@@ -19,6 +19,11 @@ def _refuse_text(value: Any) -> Any:
 
 Real = Annotated[float, BeforeValidator(_refuse_text)]  # true and "1" are no numbers
 Whole = Annotated[int, BeforeValidator(_refuse_text)]
+Number = Annotated[Real, Field(allow_inf_nan=False)]
+Positive = Annotated[Real, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[Real, Field(ge=0, allow_inf_nan=False)]
+Index = Annotated[Whole, Field(ge=0)]
+Vector = tuple[Number, Number, Number]
 
 
 class _Model(type(BaseModel)):
