@@ -30,6 +30,7 @@ EXTRAS = {
     "witness": ("ipctk",),
     "tetrahedralize": ("pytetwild",),
     "benchmarks": ("cholespy",),
+    "sweep": ("distributed", "dask"),
 }
 
 

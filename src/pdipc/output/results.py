@@ -44,6 +44,10 @@ class RunError(RuntimeError):
     """A run folder that cannot be read, resumed or written."""
 
 
+class RunLockedError(RunError):
+    """A run folder that another process is writing."""
+
+
 class RunWriter:
     """Writes a run, alone: the folder is locked until `close`, or the end of a `with`. Made by `create` or `resume`.
 
@@ -182,7 +186,7 @@ def _lock(folder: Path) -> lock.Lock:
         with _room(folder):
             return lock.Lock(folder)
     except lock.LockedError as error:
-        raise RunError(str(error)) from None
+        raise RunLockedError(str(error)) from None
 
 
 def _latest_checkpoint(run: "Run") -> tuple[int, dict[str, np.ndarray]] | None:

@@ -14,6 +14,7 @@ from pdipc.scene.explain import clipped, explain, follow
 from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import is_file
 from pdipc.scene.schema import Scene
+from pdipc.scene.vary import put
 
 BUNDLED = Path(__file__).parent.parent / "scenes"
 BYTES_PER_BYTE = 30  # of memory for a scene file: what its numbers take as Python's
@@ -25,13 +26,18 @@ def bundled_scenes() -> dict[str, Path]:
     return {path.stem: path for path in sorted(BUNDLED.glob("*.toml"))}
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | Path, changes: dict[str, Any] | None = None) -> Scene:
     """Reads a scene from a .toml or .json file, or the bundled scene of that name.
 
-    Mesh paths in the file are relative to it. Raises SceneError; its message names the file and, for every problem at once, the
-    key, the value found, and what is allowed.
+    Mesh paths in the file are relative to it. changes: values in place of those of the file, by dotted keys, such as
+    {"contact.friction": 0.3, "bodies.ball.material.young_modulus": 1e5}; see `pdipc.scene.vary`. Raises SceneError; its message names
+    the file and, for every problem at once, the key, the value found, and what is allowed.
     """
     file, data = _tables(path)
+    try:
+        data = put(data, changes) if changes else data
+    except SceneError as error:
+        raise SceneError(f'"{file}": {error}') from None
     try:
         return Scene.model_validate(data, context={"folder": file.parent})
     except ValidationError as error:
