@@ -40,7 +40,7 @@ def fake(monkeypatch):
     """Puts a simulation in place of the true one that writes what `runs` makes, and records how it was called."""
     calls = types.SimpleNamespace(interrupt_after=None, interrupt_with=signal.SIGINT, given={})
 
-    def run_scene(scene, out_dir, *, steps, device, resume, overwrite, certify, progress):
+    def run_scene(scene, out_dir, *, steps, device, resume, overwrite, certify, forces, progress):
         calls.given = {"scene": scene, "steps": steps, "device": device, "resume": resume, "certify": certify}
         if resume:
             writer = RunWriter.resume(out_dir)
@@ -280,12 +280,13 @@ def test_audit_writes_tables_and_forces_with_names(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["step"] for row in rows] == ["0", "2"]
     assert float(rows[0]["total [J]"]) == pytest.approx(sum(float(rows[0][f"{n} [J]"]) for n in ENERGIES), rel=1e-12)
-    assert {f"Fy on {name} [N]" for name in ("ball", "cloth", "floor")} < set(rows[0])
+    assert {f"normal y on {name} [N]" for name in ("ball", "cloth", "floor")} < set(rows[0])
+    assert all(rows[-1][f"torque x on {name} [N m]"] == "nan" for name in ("ball", "cloth", "floor"))  # nothing was recorded
     printed = result.stdout.splitlines()[2].split()
     assert printed[1:6] == [f"{float(rows[0][f'{n} [J]']):.4g}" for n in (*ENERGIES, "total")]
     with np.load(tmp_path / "f.npz") as forces:
         assert forces["body_names"].tolist() == ["ball", "cloth", "floor"]
-        assert forces["force"].shape == (2, len(forces["body_of_vertex"]), 3)
+        assert forces["normal"].shape == (2, len(forces["body_of_vertex"]), 3)
 
 
 ENERGIES = ("kinetic", "elastic", "barrier", "gravity")

@@ -143,5 +143,5 @@ def test_sub_steps_are_merged_by_what_their_fields_are():
         counts = fields - {"constraints", "barriers", "residual", "smallest_gap", *plain}
         assert all(getattr(merged, name) == 3 for name in counts)
     record = simulations.stats_of(StepResult(**low))
-    assert record.keys() == fields - {"state"}
+    assert record.keys() == fields - {"state", "forces"}
     assert record["smallest_gap"] is None

@@ -1,16 +1,19 @@
-"""The tutorial's Python runs as it stands there, with its own assertions."""
+"""The Python of the tutorial and of other pages runs as it stands there, with its own assertions."""
 
 import re
 from pathlib import Path
 
-TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
 
 
-def test_every_block_of_the_tutorial():
+@pytest.mark.parametrize(("page", "least"), [("tutorial", 6), ("forces", 1)])
+def test_every_block_of_a_page(page, least):
     names: dict = {}
-    text = TUTORIAL.read_text()
+    text = (DOCS / f"{page}.md").read_text()
     blocks = list(re.finditer(r"```python\n(.*?)```", text, flags=re.DOTALL))
-    assert len(blocks) > 5
+    assert len(blocks) >= least
     for block in blocks:
-        above = text[: block.start(1)].count("\n")  # so that a failure names the line of the tutorial
-        exec(compile("\n" * above + block[1], str(TUTORIAL), "exec"), names)
+        above = text[: block.start(1)].count("\n")  # so that a failure names the line of the page
+        exec(compile("\n" * above + block[1], str(DOCS / f"{page}.md"), "exec"), names)

@@ -1,4 +1,4 @@
-"""Energies, momenta and contact forces of a state: what `pdipc audit` prints, and what tests compare with mechanics."""
+"""Energies and momenta of a state, and the barrier's forces in it: what `pdipc audit` prints, and what tests compare with mechanics."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -59,38 +59,18 @@ def audit(model: Model, state: State, work: Work) -> Audit:
 
 
 @one_at_a_time
-def contact_forces(model: Model, state: State, work: Work) -> np.ndarray:
-    """(n, 3) N: the barrier's force on every vertex, on obstacles too; the resultant on a body is the sum over its vertices.
+def barrier_forces(model: Model, state: State, work: Work) -> np.ndarray:
+    """(n, 3) N: the barrier's force on every vertex, on obstacles too. Friction and what restitution adds belong to a step and not to a
+    state: `Simulation.step(forces=True)` has them.
 
-    Without friction, which depends on a step and not on a state alone. So do the targets of the paper's contact: there all is NaN.
+    Raises ValueError in the paper's mode, whose forces all belong to a step.
     """
     if model.settings.method == "paper":
-        return np.full((model.vertex_count, 3), np.nan)
+        raise ValueError(
+            "in the paper's mode forces belong to a step, not to a state: run with --forces, or step with forces=True"
+        )
     work.list_pairs(state.positions)
     return work.pairs.forces(state.positions).numpy().astype(np.float64)
-
-
-def body_forces(model: Model, state: State, work: Work) -> dict[str, np.ndarray]:
-    """(3,) N by the name of a body or obstacle: the resultant of the contact forces on it."""
-    force = contact_forces(model, state, work)
-    return {body.name: force[body.first : body.last].sum(axis=0) for body in model.assembly.bodies}
-
-
-def vertex_areas(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(n,) m^2: a third of the triangles around each surface vertex, 0 inside."""
-    corners = positions[triangles]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    total = np.zeros(len(positions))
-    for corner in range(3):
-        np.add.at(total, triangles[:, corner], area / 3.0)
-    return total
-
-
-def contact_pressures(model: Model, state: State, work: Work) -> np.ndarray:
-    """(n,) Pa: magnitude of the contact force over the area around each surface vertex."""
-    force = np.linalg.norm(contact_forces(model, state, work), axis=1)
-    area = vertex_areas(state.positions.numpy().astype(np.float64), model.triangles)
-    return np.where(area > 0.0, force / np.maximum(area, 1e-300), 0.0)
 
 
 def replay(run: Run, frames: Iterable[int] | None = None) -> Iterator[tuple[Model, State, Work]]:
@@ -109,3 +89,24 @@ def replay(run: Run, frames: Iterable[int] | None = None) -> Iterator[tuple[Mode
             velocities = (positions - run.positions(frame - 1)) / (run.times[frame] - run.times[frame - 1])
         arrays = {"positions": positions, "velocities": velocities, "time": run.times[frame], "step": frame}
         yield model, model.state_from({**start, **arrays}), work
+
+
+def vertex_forces(run: Run, frames: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Normal forces and friction (n, 3), N, on every vertex at each of the frames: as recorded, see `run_scene`; else the barrier's of the
+    state, and NaN for friction.
+
+    Raises ValueError for a run in the paper's mode that did not record them.
+    """
+    paper = run.scene.get("contact", {}).get("method") == "paper"
+    asked: list[int] = []
+    states = replay(run, iter(asked.pop, None))  # of the frames asked for, one at a time
+    for frame in frames:
+        forces = run.forces(frame)
+        if forces is not None and forces.vertex_normal is not None and forces.vertex_friction is not None:
+            yield forces.vertex_normal, forces.vertex_friction
+        elif paper and run.records[frame]["step"] == 0:  # nothing has been pushed yet
+            yield (np.zeros((len(run.scripted), 3)),) * 2
+        else:
+            asked.append(frame)
+            normal = barrier_forces(*next(states))
+            yield normal, np.full_like(normal, np.nan)

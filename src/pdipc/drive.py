@@ -7,6 +7,7 @@ import warp as wp
 
 from pdipc import algorithm
 from pdipc.device.launch import one_at_a_time
+from pdipc.forces import ContactForces
 from pdipc.integration.inertia import FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
 from pdipc.model import Model, State
@@ -25,7 +26,7 @@ class StepResult:
     force_residual: N, the largest force on a free vertex that was left at the start of the last outer iteration, and force_scale, N, the
     largest force of inertia to compare it with; 0 for other methods than Newton's.
     lag: m, how far something scripted is behind where it should be. searches: outer iterations that were turned back because
-    the potential rose. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
+    the potential rose. forces: of contact, where `Simulation.step` was asked for them. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
     CCD), barrier, misc.
     """
 
@@ -45,6 +46,7 @@ class StepResult:
     lag: float = 0.0
     force_residual: float = 0.0
     force_scale: float = 0.0
+    forces: ContactForces | None = None
 
     @property
     def estimated_error(self) -> float:

@@ -13,6 +13,7 @@ import warp as wp
 
 from pdipc.device.launch import one_at_a_time
 from pdipc.drive import StepResult, Work, step
+from pdipc.forces import collect, mean
 from pdipc.model import Model, State, build
 from pdipc.scene.schema import Scene
 
@@ -91,12 +92,20 @@ class Simulation:
         self.model.external.pulled = (vertices, forces)
 
     @one_at_a_time
-    def step(self) -> StepResult:
-        """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them."""
+    def step(self, forces: bool = False) -> StepResult:
+        """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them.
+
+        forces: also the forces of contact, `result.forces`, on vertices, bodies and pairs of bodies.
+        """
         self.model.device.refuse_forked()
-        return _merge(
-            [step(self.model, self.state, self.work, self.observe, into=self.state) for _ in range(self.model.substeps)]
-        )
+        results, contact = [], []
+        for _ in range(self.model.substeps):
+            results.append(step(self.model, self.state, self.work, self.observe, into=self.state))
+            if forces:
+                contact.append(collect(self.model, self.positions, self.work.method.exerted()))
+        result = _merge(results)
+        result.forces = mean(contact) if forces else None
+        return result
 
     @one_at_a_time
     def reset(self) -> None:
@@ -137,17 +146,21 @@ def _merged(name: str, values: list[Any]) -> Any:
     return last
 
 
-def simulate(scene: Scene | Model, steps: int | None = None, device: str | None = None) -> Iterator[Frame]:
-    """Yields a `Frame` after each step: `for frame in pdipc.simulate(scene, steps=100): ...`."""
+def simulate(
+    scene: Scene | Model, steps: int | None = None, device: str | None = None, forces: bool = False
+) -> Iterator[Frame]:
+    """Yields a `Frame` after each step: `for frame in pdipc.simulate(scene, steps=100): ...`. forces: see `Simulation.step`."""
     simulation = Simulation(scene, device)
     for _ in range(simulation.model.scene.simulation.steps if steps is None else steps):
-        result = simulation.step()
+        result = simulation.step(forces)
         yield Frame(simulation.steps_done, simulation.state.time, simulation.positions, result)
 
 
 def stats_of(result: StepResult) -> dict[str, Any]:
     """A step's statistics as plain values, named after the columns of the paper's Table 1; None for what is not finite."""
-    record = {field.name: getattr(result, field.name) for field in dataclasses.fields(result) if field.name != "state"}
+    record = {
+        field.name: getattr(result, field.name) for field in dataclasses.fields(result) if field.name not in ("state", "forces")
+    }
     return {name: None if isinstance(value, float) and not np.isfinite(value) else value for name, value in record.items()}
 
 
@@ -160,12 +173,14 @@ def run_scene(
     resume: bool = False,
     overwrite: bool = False,
     certify: bool = False,
+    forces: bool = False,
     progress: Callable[[StepInfo], None] | None = None,
 ) -> None:
     """Simulates `scene` into the folder `out_dir`: frames, statistics, checkpoints. The folder is locked meanwhile.
 
     A run that was stopped, at any moment and by whatever, goes on with `resume=True` from its last checkpoint, and gives the same bits
-    as one that was not. certify: also record every committed motion, for `pdipc certify`. progress: called after each step.
+    as one that was not. certify: also record every committed motion, for `pdipc certify`. forces: of contact on every vertex, too; those on
+    bodies and between them are always recorded. progress: called after each step.
 
     Raises SceneError for a scene that cannot be simulated, before anything is launched; RunError where the folder does not take this
     run, is being written by another process, or has no room.
@@ -196,7 +211,7 @@ def run_scene(
         meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
     with writer:
-        _run(simulation, writer, steps, certify, progress)
+        _run(simulation, writer, steps, certify, forces, progress)
 
 
 def _without_steps(scene: Scene) -> dict[str, Any]:
@@ -217,7 +232,12 @@ def _first_difference(a: Any, b: Any, path: str = "") -> str | None:
 
 
 def _run(
-    simulation: Simulation, writer: "RunWriter", steps: int, certify: bool, progress: Callable[[StepInfo], None] | None
+    simulation: Simulation,
+    writer: "RunWriter",
+    steps: int,
+    certify: bool,
+    forces: bool,
+    progress: Callable[[StepInfo], None] | None,
 ) -> None:
     """From the last checkpoint, or the start where there is none, to the end."""
     checkpoint = writer.latest_checkpoint()
@@ -241,8 +261,10 @@ def _run(
     try:
         while done < steps:
             whole, motions = False, 0
-            result = simulation.step()
-            writer.append(simulation.steps_done, simulation.state.time, simulation.positions, stats_of(result))
+            result = simulation.step(forces=True)
+            assert result.forces is not None
+            contact = result.forces.arrays(vertices=forces)
+            writer.append(simulation.steps_done, simulation.state.time, simulation.positions, stats_of(result), contact)
             done, whole = simulation.steps_done, True
             if time.monotonic() - last_checkpoint > CHECKPOINT_SECONDS or done == steps:
                 writer.checkpoint(done, simulation.state.arrays())

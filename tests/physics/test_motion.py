@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pdipc.audit import contact_forces
+from pdipc.audit import barrier_forces
 
 from .scenes import cloth, floor, scene, solid, watched
 
@@ -60,7 +60,7 @@ def test_block_at_rest_carries_its_weight():
     simulation = watched(scene([body], [floor()], contact=contact, damping=5.0, time_step=0.01))
     run(simulation, 100)
     model = simulation.model
-    force = contact_forces(model, simulation.state, simulation.work)
+    force = barrier_forces(model, simulation.state, simulation.work)
     weight = model.external.mass.sum() * G
     np.testing.assert_allclose(force[: model.assembly.bodies[0].last, 1].sum(), weight, rtol=0.01)
     speed = np.abs(simulation.state.velocities.numpy()).max()

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.barrier import potential as barrier
-from pdipc.barrier.pairs import ActivePairs
+from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
 
@@ -346,6 +346,11 @@ class BarrierTerm(ActivePairs):
         device.launch_list(k.differentiate, self.capacity, [self.count, x, *frozen, *result, *bent])
         inputs = [self.ends, self.entries, self.quads, self.free, *result]
         device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+
+    def pushed(self) -> Exerted:
+        """The barrier's forces where it was last differentiated, and what restitution added. Not recordable."""
+        quads, weights, normals, slope, rebound = self.listed(self.quads, self.weights, self.normals, self.slope, self.rebound)
+        return Exerted(quads, weights[:, :, None] * (rebound[:, None] * normals)[:, None, :] - slope)
 
     def forces(self, x: wp.array) -> wp.array:
         """(n,) vec3, N: what the frozen pairs exert at x on each vertex."""

@@ -12,6 +12,7 @@ import warp as wp
 
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.exact import BarrierTerm
+from pdipc.barrier.pairs import Exerted, listed
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
 
@@ -235,6 +236,11 @@ class FrictionTerm:
         device.launch_list(k.evaluate, self.capacity, [*inputs, *result])
         inputs = [self.ends, self.entries, self.quads, self.weights, self.source.free, *result]
         device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+
+    def rubbed(self) -> Exerted:
+        """The forces where they were last differentiated. Not recordable."""
+        quads, weights, force = listed(int(self.count.numpy()[0]), self.quads, self.weights, self.force)
+        return Exerted(quads, weights[:, :, None] * force[:, None, :])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (friction Hessian) p. Recordable."""

@@ -14,8 +14,10 @@ iteration does not work here: after a truncation the frozen gap, and so lambda, 
 """
 
 import functools
+from dataclasses import dataclass
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from pdipc.barrier import potential as barrier
@@ -374,6 +376,16 @@ def kernels(real: Real) -> SimpleNamespace:
     )
 
 
+@dataclass
+class Exerted:
+    """Forces of pairs. quads: (k, 4) int32, the vertices of each, of which the first is on one side and the last on the other. forces:
+    (k, 4, 3) float64, N, on each of these vertices.
+    """
+
+    quads: np.ndarray
+    forces: np.ndarray
+
+
 class ActivePairs:
     """The barriers and friction of one outer iteration, and the contact operator that the linear solver applies.
 
@@ -407,6 +419,7 @@ class ActivePairs:
         self.coefficient, self.friction = make(real.scalar), make(real.scalar)
         self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
+        self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
@@ -470,6 +483,22 @@ class ActivePairs:
         self.linearize(x, x, x, force)
         return force
 
+    def exerted(self, u: wp.array, u_start: wp.array) -> tuple[Exerted, Exerted]:
+        """Along the normals and across them: what the frozen pairs exert where they were frozen, with the slip u - u_start since the start
+        of the step, and what restitution added. Not recordable.
+        """
+        self.linearize(u, u, u_start, wp.zeros(len(self.ends), dtype=self.real.vec3, device=self.device.warp))
+        quads, weights, normals, force = self.listed(self.quads, self.weights, self.normals, self.force)
+        along = np.einsum("ki,ki->k", force, normals)
+        across = force - along[:, None] * normals
+        along += self.listed(self.rebound)[0]
+        pushed, rubbed = (weights[:, :, None] * each[:, None, :] for each in (along[:, None] * normals, across))
+        return Exerted(quads, pushed), Exerted(quads, rubbed)
+
+    def listed(self, *arrays: wp.array) -> list[np.ndarray]:
+        """The entries in use of arrays with one a pair, numbers as float64."""
+        return listed(int(self.count.numpy()[0]), *arrays)
+
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
         inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
@@ -490,3 +519,9 @@ class ActivePairs:
             [self.count, self.gaps, self.activation, self.stiffness, self.energies],
         )
         self.energy_sum.sum(self.energies, out, slot)
+
+
+def listed(count: int, *arrays: wp.array) -> list[np.ndarray]:
+    """The first `count` entries, numbers as float64."""
+    found = [array[:count].numpy() for array in arrays]
+    return [each if each.dtype.kind == "i" else each.astype(np.float64) for each in found]

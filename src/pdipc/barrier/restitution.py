@@ -44,6 +44,10 @@ def kernels(real: Real) -> SimpleNamespace:
         needed_out[0] = 0
 
     @wp.kernel(module=module)
+    def forget(first: int, rebound_out: wp.array(dtype=scalar)):
+        rebound_out[first + wp.tid()] = scalar(0.0)
+
+    @wp.kernel(module=module)
     def aim(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -217,12 +221,36 @@ def kernels(real: Real) -> SimpleNamespace:
         part_out[0] = part
 
     @wp.kernel(module=module)
+    def keep(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        x_now: wp.array(dtype=vec3),
+        target: wp.array(dtype=scalar),
+        pull: wp.array(dtype=scalar),
+        part: wp.array(dtype=scalar),
+        rebound_out: wp.array(dtype=scalar),
+    ):
+        """Of each pair: the force along the normal, N, that over the step makes the correction."""
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                moved = vec3()
+                for s in range(4):
+                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
+                rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(normals[k], moved))
+
+    @wp.kernel(module=module)
     def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):
         i = first + wp.tid()
         x_now[i] = x[i] + part[0] * (x_now[i] - x[i])
 
     return SimpleNamespace(
         clear=clear,
+        forget=forget,
         aim=aim,
         inertia=inertia,
         linearize=linearize,
@@ -230,6 +258,7 @@ def kernels(real: Real) -> SimpleNamespace:
         move=move,
         kinetic=kinetic,
         limit=limit,
+        keep=keep,
         shorten=shorten,
     )
 
@@ -269,6 +298,7 @@ class Restitution:
         k, device, p = self.kernels, self.device, self.pairs
         device.copy(self.u_now, x)
         device.launch_serial(k.clear, [self.needed])
+        device.launch(k.forget, p.capacity, [p.rebound])
         pairs = [p.count, p.quads, p.weights, p.normals]
         motion = [x_start, x, v_start, self.free, self.body_mass, self.rigidity, self.restitution, self.h]
         # `gaps` and `stiffness` of the pairs are of no further use in this step
@@ -304,4 +334,7 @@ class Restitution:
         for values, place in zip(self.energies, (SQUARE, CROSS, EXCESS), strict=True):
             self.reducer.sum(values, self.sums, place)
         device.launch_serial(k.limit, [self.sums, self.part])
+        p = self.pairs
+        pairs = [p.count, p.quads, p.weights, p.normals]
+        device.launch_list(k.keep, p.capacity, [*pairs, x_start, self.u_now, p.gaps, p.stiffness, self.part, p.rebound])
         device.launch(k.shorten, n, [x, self.part, self.u_now])

@@ -1,7 +1,7 @@
 """Runs before the judges: `pdipc check`, `pdipc certify`, `pdipc audit`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pdipc.audit import Audit
+    from pdipc.forces import ContactForces
     from pdipc.output.results import Run
 
 LISTED = 20  # intersecting pairs that `check` prints of a frame
@@ -75,17 +76,18 @@ def audit(
     forces: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write contact forces, N, and pressures, Pa, at every vertex, with the bodies: .npz."
+            metavar="FILE", help="Write normal forces, friction, N, and pressures, Pa, at every vertex, with the bodies: .npz."
         ),
     ] = None,
     csv: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the table, and the contact force on each body, N: .csv.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the table, and the contact forces on each body and of each on each other: .csv."
+        ),
     ] = None,
     every: Annotated[int, typer.Option(min=1, help="Takes every so many frames.")] = 1,
 ) -> None:
     """Energies, momenta and contact forces of a run, step by step."""
-    import numpy as np
-
     from pdipc import audit as audits
     from pdipc.output.results import open_run
 
@@ -100,26 +102,24 @@ def audit(
     opened = open_run(folder)
     taken = range(0, opened.frame_count, every)
     typer.echo(_AUDIT_HEAD)
-    rows, resultants, at_vertices = [], [], []
+    rows, contacts = [], []
     for frame, state in zip(taken, audits.replay(opened, taken), strict=True):
         row = audits.audit(*state)
         typer.echo(f"{opened.records[frame]['step']:6} " + " ".join(f"{value:11.4g}" for value in _numbers(row)))
         rows.append(row)
-        resultants.append(audits.body_forces(*state))
-        if forces is not None:
-            at_vertices.append((audits.contact_forces(*state), audits.contact_pressures(*state)))
+        contacts.append(opened.forces(frame))
+    if taken:
+        _print_forces(opened, taken[-1], contacts[-1])
     if forces is not None:
-        force, pressure = (np.array(values, dtype=np.float32) for values in zip(*at_vertices, strict=True))
-        bodies = {name: opened.topology[name] for name in ("body_names", "body_kinds", "body_of_vertex")}
-        np.savez_compressed(forces, time=opened.times[taken], force=force, pressure=pressure, **bodies)
+        _write_forces(forces, opened, taken)
         typer.echo(str(forces))
     if csv is not None:
-        _write_csv(csv, [opened.records[frame] for frame in taken], rows, resultants)
+        _write_csv(csv, opened, taken, rows, contacts)
         typer.echo(str(csv))
     if out is not None:
         from pdipc.output.plot import plot_audits
 
-        plot_audits(rows, resultants, out)
+        plot_audits(rows, opened.body_names, contacts, out)
         typer.echo(str(out))
 
 
@@ -136,15 +136,64 @@ def _numbers(row: "Audit") -> list[float]:
     return [float(value) for value in (*energies, *row.linear_momentum, *row.angular_momentum)]
 
 
-def _write_csv(path: Path, records: list[dict[str, Any]], rows: list["Audit"], resultants: list[dict]) -> None:
-    """A line a frame, with digits that give the same float64 back; the columns name their units."""
+def _print_forces(opened: "Run", frame: int, contact: "ContactForces | None") -> None:
+    """A line for each side of each pair of bodies that touched in the step that led to the frame."""
+    step = opened.records[frame]["step"]
+    if contact is None:
+        typer.echo(f"no forces of contact are recorded for step {step}")
+        return
+    typer.echo(f"forces of contact in step {step}, N, and their torque about the centre of what they act on, N m: x, y, z each")
+    for pair, *values in zip(contact.touching(), contact.normal, contact.friction, contact.torque, strict=True):
+        told = (f"{name} ({', '.join(f'{x:.4g}' for x in value)})" for name, value in zip(_OF_FORCES, values, strict=True))
+        typer.echo(f'  on "{pair[0]}" by "{pair[1]}": ' + ", ".join(told))
+    if not len(contact.pairs):
+        typer.echo("  no bodies touch")
+
+
+_OF_FORCES = {"normal": "N", "friction": "N", "torque": "N m"}
+
+
+def _write_forces(path: Path, opened: "Run", taken: range) -> None:
+    import numpy as np
+
+    from pdipc.audit import vertex_forces
+    from pdipc.forces import pressures
+
+    found = [
+        (*both, pressures(both[0], opened.positions(frame), opened.triangles))
+        for frame, both in zip(taken, vertex_forces(opened, taken), strict=True)
+    ]
+    normal, friction, pressure = (np.array(values, dtype=np.float32) for values in zip(*found, strict=True))
+    if np.isnan(friction[1:]).any():
+        typer.echo("note: friction at vertices is unknown (NaN): record it with `pdipc run --forces`", err=True)
+    bodies = {name: opened.topology[name] for name in ("body_names", "body_kinds", "body_of_vertex")}
+    arrays = {"time": opened.times[taken], "normal": normal, "friction": friction, "pressure": pressure, **bodies}
+    np.savez_compressed(path, **arrays)
+
+
+def _write_csv(path: Path, opened: "Run", taken: range, rows: list["Audit"], contacts: "list[ContactForces | None]") -> None:
+    """A line a frame, with digits that give the same float64 back; the columns name their units. Forces: of all contact on each body,
+    then those of each body on each other that it ever touches; nan where none are recorded, as at the start.
+    """
     import csv
 
-    bodies = list(resultants[0]) if resultants else []
+    import numpy as np
+
+    touching = sorted({pair for contact in contacts if contact is not None for pair in contact.touching()})
+    sides = [(name, None) for name in opened.body_names] + touching
     head = ["step", "time [s]", *(f"{name} [{unit}]" for name, unit in zip(_AUDITED, _UNITS, strict=True))]
-    head += [f"F{axis} on {body} [N]" for body in bodies for axis in "xyz"]
+    head += [
+        f"{what} {axis} on {body}{f' by {by}' if by else ''} [{unit}]"
+        for body, by in sides
+        for what, unit in _OF_FORCES.items()
+        for axis in "xyz"
+    ]
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(head)
-        for record, row, on in zip(records, rows, resultants, strict=True):
-            table.writerow([record["step"], record["time"], *_numbers(row), *(float(x) for body in bodies for x in on[body])])
+        for frame, row, contact in zip(taken, rows, contacts, strict=True):
+            record, values = opened.records[frame], np.full((len(sides), 3, 3), np.nan)
+            if contact is not None:
+                on = (contact.on(*side) for side in sides)
+                values = np.array([[force.normal, force.friction, force.torque] for force in on])
+            table.writerow([record["step"], record["time"], *_numbers(row), *values.ravel().tolist()])

@@ -81,10 +81,14 @@ def _pressure(opened: "Run", frames: "Iterable[int]") -> "Field":
     """Contact pressure on the given frames; the last colour stands for what one in a hundred loaded vertices exceeds."""
     import numpy as np
 
-    from pdipc.audit import contact_pressures, replay
+    from pdipc.audit import vertex_forces
+    from pdipc.forces import pressures
     from pdipc.output.render import Field
 
-    found = dict(zip(frames, (contact_pressures(*state) for state in replay(opened, frames)), strict=True))
+    found = {
+        frame: pressures(normal, opened.positions(frame), opened.triangles)
+        for frame, (normal, _) in zip(frames, vertex_forces(opened, frames), strict=True)
+    }
     loaded = np.concatenate([values[values > 0.0] for values in found.values()])
     return Field("contact pressure, Pa", found.__getitem__, float(np.quantile(loaded, 0.99)) if len(loaded) else 1.0)
 

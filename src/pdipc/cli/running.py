@@ -40,6 +40,9 @@ def run(
         float | None, typer.Option(min=0.001, help="No further outer iteration of a step after this time, ms.")
     ] = None,
     certify: Annotated[bool, typer.Option("--certify", help="Record every motion for `pdipc certify`.")] = False,
+    forces: Annotated[
+        bool, typer.Option("--forces", help="Record contact forces on every vertex, not only on bodies and between them.")
+    ] = False,
     solver: Annotated[str | None, typer.Option(help="Linear solver of the global step.")] = None,
     precision: Annotated[Precision | None, typer.Option(help="Working precision.")] = None,
     audited: Annotated[
@@ -69,7 +72,7 @@ def run(
                 bar(info)
                 stop.step_done(info.step)
 
-            options = {"resume": resume, "overwrite": overwrite, "certify": certify}
+            options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
             run_scene(loaded, folder, steps=steps, device=device, progress=advance, **options)
     except KeyboardInterrupt:
         if stop.done is None:
@@ -84,7 +87,7 @@ def run(
             said = "".join(f" {name} {value}" for name, value in given.items() if value is not None)
             typer.echo(
                 f"pdipc: stopped after step {stop.done} of {total}, everything is saved in {folder}; go on with:\n"
-                f"  pdipc run {scene} -o {folder}{said}{' --certify' if certify else ''} --resume",
+                f"  pdipc run {scene} -o {folder}{said}{' --certify' if certify else ''}{' --forces' if forces else ''} --resume",
                 err=True,
             )
         raise typer.Exit(128 + stop.signal) from None  # what shells expect

@@ -4,6 +4,8 @@ from typing import Protocol
 
 import warp as wp
 
+from pdipc.barrier.pairs import Exerted
+
 
 class Method(Protocol):
     """How lines 5 to 12 and 16 of Algorithm 1 are done; chosen once, when `Work` is made. Every method only launches.
@@ -32,6 +34,10 @@ class Method(Protocol):
 
     def accept(self) -> None:
         """Line 16: commits the truncated motion to `u` and `x`, and decides whether to go on: `going` and the status in `count`."""
+        ...
+
+    def exerted(self) -> tuple[Exerted, Exerted]:
+        """The forces of contact in the step that was taken last, along the normals and across them. Not launched from a recording."""
         ...
 
     def grow(self) -> bool:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from pdipc.barrier.pairs import ActivePairs
+from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
@@ -184,6 +184,12 @@ class LocalGlobal:
     def grow(self) -> bool:
         """Makes room where a list was full."""
         return self.pairs.grow()
+
+    def exerted(self) -> tuple[Exerted, Exerted]:
+        """See `nonlinear.Method`: the pairs of where the step ended."""
+        w = self.work
+        self.pairs.freeze(w.candidates, w.x)
+        return self.pairs.exerted(w.u, w.rest)
 
     def start(self) -> None:
         """Nothing is known of the motion yet but the predictor."""

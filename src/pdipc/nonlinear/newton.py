@@ -29,6 +29,7 @@ import warp as wp
 
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.friction import FrictionTerm
+from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.collision.islands import Islands
 from pdipc.device.launch import Reducer
@@ -641,6 +642,16 @@ class Newton:
         if grown and self.friction is not None:
             self.friction.grow()
         return grown
+
+    def exerted(self) -> tuple[Exerted, Exerted]:
+        """See `nonlinear.Method`: the gradients of barrier and friction where the step ended."""
+        w = self.work
+        if w.restitution is not None:  # which leaves its own in their place
+            self.pairs.freeze(w.candidates, w.x)
+            self.pairs.differentiate(w.x)
+        pushed = self.pairs.pushed()
+        rubbed = Exerted(pushed.quads[:0], pushed.forces[:0]) if self.friction is None else self.friction.rubbed()
+        return pushed, rubbed
 
     def _couplings(self) -> list:
         """What the matrix has beside the blocks of elements."""

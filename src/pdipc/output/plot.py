@@ -8,10 +8,13 @@ import numpy as np
 
 if TYPE_CHECKING:
     from pdipc.audit import Audit
+    from pdipc.forces import ContactForces
 
 
-def plot_audits(audits: Sequence["Audit"], resultants: Sequence[dict[str, np.ndarray]], path: Path) -> None:
-    """Energies, momenta and the contact forces on each body over time, into `path`."""
+def plot_audits(
+    audits: Sequence["Audit"], bodies: Sequence[str], contacts: "Sequence[ContactForces | None]", path: Path
+) -> None:
+    """Energies, momenta and the contact forces on each body over time, into `path`; None: of a frame without recorded forces."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -25,8 +28,8 @@ def plot_audits(audits: Sequence["Audit"], resultants: Sequence[dict[str, np.nda
     for axes, name in ((linear, "linear_momentum"), (angular, "angular_momentum")):
         for component, label in enumerate("xyz"):
             axes.plot(time, [getattr(audit, name)[component] for audit in audits], label=label)
-    for body in resultants[0] if resultants else ():
-        force.plot(time, [each[body][1] for each in resultants], label=body)
+    for body in bodies:
+        force.plot(time, [np.nan if contact is None else contact.on(body).total[1] for contact in contacts], label=body)
     for axes, title in (
         (energy, "energies, J"),
         (linear, "linear momentum, kg m/s"),

@@ -6,6 +6,7 @@
     frames/         000000.npy, ...: positions (n, 3) of each step, m
     stats.jsonl     a line per frame: step, time, statistics of the step
     run.vtkhdf      the same frames for ParaView, up to the last checkpoint
+    forces/         000001.npz, ...: forces of contact in each step, see `pdipc.forces.ContactForces`
     checkpoints/    the last two states, bit for bit
     segments/       with --certify: the ends of every committed motion
     run.lock        who is writing, while somebody is: see `lock`
@@ -31,10 +32,12 @@ from typing import Any
 
 import numpy as np
 
+from pdipc.forces import ContactForces
 from pdipc.output import lock
 
 FORMAT = 1
-NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", "frames", "checkpoints", "segments", lock.NAME}
+FOLDERS = ("frames", "forces", "checkpoints", "segments")
+NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", *FOLDERS, lock.NAME}
 CHECKPOINTS_KEPT = 2
 NO_ROOM = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC), None}  # None: what NumPy says of a full disk
 UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
@@ -119,7 +122,7 @@ class RunWriter:
                 _write_text(run.folder / "stats.jsonl", "".join(_line(record) for record in kept))
                 for path in [*run.folder.glob("*.tmp"), *run.folder.glob("*/*.tmp")]:
                     _remove(path)
-                for name in ("frames", "checkpoints", "segments"):
+                for name in FOLDERS:
                     for path in run.folder.glob(f"{name}/*.np?"):
                         if _step_of(path) > last:
                             _remove(path)
@@ -141,13 +144,25 @@ class RunWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def append(self, step: int, time: float, positions: np.ndarray, stats: dict[str, Any]) -> None:
-        """Adds the frame of `step`: positions (n, 3), m, at `time`, s, and the statistics of the step."""
+    def append(
+        self,
+        step: int,
+        time: float,
+        positions: np.ndarray,
+        stats: dict[str, Any],
+        forces: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        """Adds the frame of `step`: positions (n, 3), m, at `time`, s, and the statistics of the step; forces: those of
+        `ContactForces.arrays`.
+        """
         positions = np.asarray(positions)
         single = positions.astype(np.float32)
         lossless = np.array_equal(single.astype(np.float64), positions)  # what a float32 simulation gives
         with _room(self.folder):
             _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
+            if forces is not None:
+                (self.folder / "forces").mkdir(exist_ok=True)
+                _write_arrays(self.folder / "forces" / f"{step:06d}.npz", forces)
             with open(self.folder / "stats.jsonl", "a", encoding="utf-8") as file:
                 file.write(_line({"step": int(step), "time": float(time), **stats}))
         self.frames.append((int(step), float(time)))
@@ -266,6 +281,33 @@ class Run:
                 f"{path} holds {found.dtype} of shape {found.shape}; it must hold floating-point numbers of shape {right}"
             )
         return found.astype(np.float64)
+
+    def forces(self, frame: int) -> ContactForces | None:
+        """Forces of contact in the step that led to `frame`; None at the start and where none were recorded.
+
+        Raises IndexError where there is no such frame, RunError where the file is damaged.
+        """
+        step = self.records[frame]["step"]
+        path = self.folder / "forces" / f"{step:06d}.npz"
+        if not path.is_file():
+            return None
+        try:
+            arrays, rows, n = _read_arrays(path), None, len(self.topology["body_of_vertex"])
+            rows = len(arrays["pairs"])
+            right = {"pairs": (rows, 2), **dict.fromkeys(("normal", "friction", "torque"), (rows, 3))}
+            right["centers"] = (len(self.body_names), 3)
+            if "vertices" in arrays:
+                loaded = len(arrays["vertices"])
+                right |= {"vertices": (loaded,), **dict.fromkeys(("vertex_normal", "vertex_friction"), (loaded, 3))}
+            for name, shape in right.items():
+                if arrays[name].shape != shape:
+                    raise ValueError(f"{name} has the shape {arrays[name].shape}; it must be {shape}")
+            for name, below in (("pairs", len(self.body_names)), ("vertices", n)):
+                if name in arrays and arrays[name].size and not 0 <= arrays[name].min() <= arrays[name].max() < below:
+                    raise ValueError(f"{name} names what is not there")
+            return ContactForces.from_arrays(self.body_names, n, {name: arrays[name] for name in right})
+        except UNREADABLE as error:
+            raise RunError(f"{path} cannot be read: {error}") from error
 
     @property
     def triangles(self) -> np.ndarray:

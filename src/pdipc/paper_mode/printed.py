@@ -2,12 +2,15 @@
 
 import functools
 
+import numpy as np
 import warp as wp
 
+from pdipc.barrier.pairs import Exerted
 from pdipc.device.precision import Real
 from pdipc.nonlinear import status
 from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.paper_mode.energy_rate import EnergyRate
+from pdipc.paper_mode.reactions import reactions
 from pdipc.paper_mode.targets import OUTER_SQUARED, PaperPairs
 
 
@@ -89,6 +92,22 @@ class Printed(LocalGlobal):
     def solve_linear(self, increment: wp.array, rhs: wp.array) -> None:
         """Line 10."""
         self.model.solver.solve(increment, rhs, self.pairs, prepared=True)
+
+    def exerted(self) -> tuple[Exerted, Exerted]:
+        """See `nonlinear.Method`: what contact did to each body, by Newton's second law, all of it as if along the normals; see `reactions`."""
+        w, model, k = self.work, self.model, self.kernels
+        s, n, real = model.settings, model.vertex_count, model.real
+        inputs = [w.u, w.rest, w.z, model.mass, model.free, real.scalar(s.time_step), real.scalar(s.damping)]
+        self.device.launch(k.inertia, n, [*inputs, self.force, self.increment])
+        model.projector.add_forces(w.x_start, w.u, self.rhs, self.force)
+        missing = -self.rhs.numpy().astype(np.float64) * model.free_vertices[:, None]
+        pushed = [self.pairs.listed(self.pairs.quads, self.pairs.weights, self.pairs.pull)]  # those that pushed last
+        self.pairs.freeze(w.candidates, w.x)
+        pushed.append(self.pairs.listed(self.pairs.quads, self.pairs.weights, self.pairs.pull))  # those that it came to
+        quads, weights, pull = (np.concatenate(parts) for parts in zip(*pushed, strict=True))
+        parts = np.abs(weights) * pull[:, None]
+        forces = reactions(missing, quads, parts, model.assembly.body_of_vertex, model.free_vertices)
+        return Exerted(quads, forces), Exerted(quads[:0], forces[:0])
 
     def _decide(self, kernel: wp.Kernel, extra: list) -> None:
         w = self.work
