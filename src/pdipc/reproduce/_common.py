@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from pdipc.judge.witness import find_intersections
-from pdipc.output.render import Picture
+from pdipc.output.render import drawing, settings_of
 from pdipc.output.results import Run, RunWriter, open_run
 from pdipc.scene.assembly import assemble
 from pdipc.scene.schema import Scene
@@ -126,17 +126,9 @@ def pictures(
 ) -> list[np.ndarray]:
     """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`)."""
     frames = list(frames)
-    picture = Picture(run, list(framed or frames), size, view)
-    try:
-        return [_shot(picture, frame) for frame in frames]
-    finally:
-        picture.plotter.close()
-
-
-def _shot(picture: Picture, frame: int) -> np.ndarray:
-    picture.show(frame)
-    picture.plotter.render()
-    return np.array(picture.plotter.screenshot(return_img=True))
+    settings = settings_of(run).model_copy(update={"size": size, "view": view})
+    with drawing(run, list(framed or frames), settings) as drawn:
+        return [drawn.image(frame) for frame in frames]
 
 
 def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Tag
 from pydantic.fields import FieldInfo
 
-from pdipc.scene import garments, generators, schema
+from pdipc.scene import garments, generators, looks, schema
 from pdipc.scene.load import bundled_scenes, load_scene
 from pdipc.scene.meshes import TET_SUFFIXES, TRIANGLE_SUFFIXES
 
@@ -20,6 +20,7 @@ SECTIONS = {
     "Pins, selections, attachments": (schema.Pin, schema.Selection, schema.Attachment),
     "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe, schema.Deformation, schema.FrameArrays),
     "Forces": (schema.Wind, schema.VertexForce),
+    "Pictures": (looks.Picture, looks.Look),
     "Shapes and arrays": (*generators.SHAPES, schema.Arrays),
 }
 HEAD = f"""# Scene format

@@ -26,6 +26,7 @@ from pydantic import (
 from pdipc.scene import generators
 from pdipc.scene.explain import short
 from pdipc.scene.garments import Inside
+from pdipc.scene.looks import Look, Picture
 from pdipc.scene.tables import Index, NotNegative, Number, Positive, Real, Table, Vector, Whole
 
 SHORTEST_STEP = 1e-9  # s
@@ -325,6 +326,7 @@ class Placed(Table):
         description="Gap kept between copies of this body, such as the thickness of cloth, m; two bodies keep the mean. "
         "Absent: that of `contact`.",
     )
+    look: Look = Field(default_factory=Look, description="How it is drawn.")
 
 
 # --- materials ---
@@ -642,6 +644,7 @@ class Scene(Table):
     obstacles: list[Obstacle] = Field(default=[], description="Rigid surfaces, static or scripted.")
     attachments: list[Attachment] = Field(default=[], description="Springs between bodies.")
     forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field(default=[], description="Beyond gravity.")
+    picture: Picture = Field(default_factory=Picture, description="How runs are drawn.")
 
     @model_validator(mode="after")
     def _check(self) -> "Scene":

@@ -1,0 +1,20 @@
+"""Python in documents runs as it stands there."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.mark.parametrize("page", ["pictures"])
+def test_python_of_the_page(page):
+    pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
+    names: dict = {}
+    text = (DOCS / f"{page}.md").read_text()
+    blocks = list(re.finditer(r"```python\n(.*?)```", text, flags=re.DOTALL))
+    assert blocks
+    for block in blocks:
+        above = text[: block.start(1)].count("\n")  # so that a failure names the line of the page
+        exec(compile("\n" * above + block[1], page, "exec"), names)
