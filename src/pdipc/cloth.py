@@ -9,6 +9,7 @@ from pdipc.constraints import (
     enclosed_volume,
     material,
     quadratic_bending,
+    stitch,
     triangle_area,
     triangle_strain,
     triangles,
@@ -39,6 +40,16 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
         sets.append(enclosed_volume.rest(outward, cavity, np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (len(cavity), 1))))
     mass = material.lumped_mass(len(x), body.triangles, m.areal_density * triangles.rest_shape(x, body.triangles)[1])
     return sets, mass
+
+
+def seams(assembly: Assembly) -> list[constraints.ConstraintSet]:
+    """The threads of all stitches, as they are at the start."""
+    return [stitch.rest(s.elements, s.weights, s.stiffness, s.lengths(0.0)) for s in assembly.stitches]
+
+
+def thread_lengths(assembly: Assembly, time: float) -> np.ndarray:
+    """(k,) m: the lengths of all threads at `time`, s, in the order of `seams`."""
+    return np.concatenate([s.lengths(time) for s in assembly.stitches])
 
 
 def cavities(assembly: Assembly, body: AssembledBody) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -172,10 +172,12 @@ class Model:
         return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
 
     def set_time(self, time: float) -> None:
-        """Uploads what a script says of `time`, s: where the points of soft pins are, and what closed sheets hold."""
+        """Uploads what a script says of `time`, s: where the points of soft pins are, how long threads are, and what closed sheets hold."""
         soft = [pin for pin in self.assembly.pins if pin.stiffness is not None and len(pin.vertices)]
         if self.projector.anchors is not None:
             self.projector.anchors.assign(np.concatenate([self.assembly.pin_targets(pin, time) for pin in soft]))
+        if self.projector.threads is not None:
+            self.projector.threads.assign(cloth.thread_lengths(self.assembly, time))
         if self.projector.cavities is not None:
             self.projector.cavities.laws.assign(self._fillings.laws(time))
 
@@ -193,7 +195,7 @@ class Model:
     @functools.cached_property
     def changes(self) -> bool:
         """Whether anything that acts on bodies changes with time by a script."""
-        return self.moves or any(body.inside is not None for body in self.assembly.bodies)
+        return self.moves or bool(self.assembly.stitches) or any(body.inside is not None for body in self.assembly.bodies)
 
     def kinematic_targets(self, time: float) -> np.ndarray:
         """(n, 3) m: where the kinematic vertices are at `time`; the start for all others."""
@@ -358,4 +360,4 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
     for a in assembly.attachments:
         pairs = np.stack([a.vertices_a, a.vertices_b], axis=1)
         sets.append(edge_length.rest(x, pairs, a.stiffness, a.rest_lengths))
-    return sets, mass
+    return sets + cloth.seams(assembly), mass

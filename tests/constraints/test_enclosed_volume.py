@@ -23,7 +23,7 @@ LAWS = {
 
 def two_balls(law, threads=1, precision="float64", filled=1.1):
     """Dented balls of radius 0.5 and 0.7 that hold the same in `filled` times their volume; the second far from the origin."""
-    mesh = Sphere(radius=0.5, cells=4).mesh().surface()
+    mesh = Sphere(radius=0.5, cells=2).mesh().surface()
     x = np.concatenate([mesh.vertices, 1.4 * mesh.vertices + [50.0, 20.0, -30.0]])
     x = x + 0.03 * np.random.default_rng(0).standard_normal(x.shape)
     triangles = np.concatenate([mesh.triangles, mesh.triangles + len(mesh.vertices)]).astype(np.int32)
@@ -78,7 +78,7 @@ def test_force_and_hessian_are_derivatives(law):
     assert np.abs(product(x, projector, p, EXACT) - change).max() < 1e-7 * np.abs(change).max()
 
 
-@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+@pytest.mark.parametrize("law", [LAWS["pressure"], LAWS["adiabatic gas"]], ids=["pressure", "adiabatic gas"])
 def test_projected_hessian_is_what_is_positive(law):
     x, projector, _ = two_balls(law)
     n = 3 * len(x)

@@ -14,6 +14,7 @@ from pdipc.constraints import (
     neo_hookean,
     point_attachment,
     quadratic_bending,
+    stitch,
     tet_strain,
     tet_volume,
     triangle_area,
@@ -59,6 +60,11 @@ def make(kind, rng):
         return x, kind.rest(
             surface, cavity, np.column_stack([0 * volume - 2.0, 0 * volume + 2.0, 0 * volume + 1.4, 0 * volume + 3.0, volume])
         )
+    if kind is stitch:
+        x = rng.standard_normal((8, 3))
+        weights = np.array([[0.2, 0.3, 0.5], [1.0, 0.0, 0.0]])
+        distance = np.linalg.norm(np.einsum("ek,ekd->ed", weights, x.reshape(2, 4, 3)[:, 1:]) - x[::4], axis=1)
+        return x, kind.rest(np.arange(8).reshape(2, 4), weights, 2.0, distance)
     if kind is point_attachment:
         x = rng.standard_normal((4, 3))
         return x, kind.rest(x[:3], np.arange(3), 2.0)

@@ -14,6 +14,7 @@ from pdipc.constraints import (
     neo_hookean,
     point_attachment,
     quadratic_bending,
+    stitch,
     tet_strain,
     tet_volume,
     triangle_area,
@@ -35,6 +36,7 @@ KINDS = (
     quadratic_bending,
     curved_bending,
     enclosed_volume,
+    stitch,
     point_attachment,
 )
 
@@ -71,6 +73,7 @@ class Projector:
     sets: one a kind, elements in the order of the bodies. bending: those of them whose Hessian depends on the state, in the order in
     which their blocks are stored.
     anchors: the points of attachments, (k,) vec3, or None; assign to it to move the points.
+    threads: the lengths of stitches, (k,), or None; assign to it to sew.
     cavities: what closed sheets hold, or None; a part of the Newton matrix as well.
     energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
     blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row.
@@ -88,6 +91,7 @@ class Projector:
         self._batches = []
         self.bending: list[ConstraintSet] = []
         self.anchors: wp.array | None = None
+        self.threads: wp.array | None = None
         self.cavities: enclosed_volume.Cavities | None = None
         slot = element = block = 0
         for s in self.sets:
@@ -96,6 +100,8 @@ class Projector:
             rest = kind.arguments(device, real, s)
             if kind is point_attachment:
                 self.anchors = rest[0]
+            if kind is stitch:
+                self.threads = rest[1]
             if kind is enclosed_volume:
                 c = self.cavities = enclosed_volume.Cavities(device, real, n_vertices, s)
                 rest = [c.number, c.pressure, c.leader, c.first, c.energy]

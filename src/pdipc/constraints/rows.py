@@ -34,12 +34,32 @@ def keep_length(real: Real) -> Callable:
     return project
 
 
+def limit_length(real: Real) -> Callable:
+    """project(v, length): the nearest vector that is no longer."""
+    scalar, vec3 = real.scalar, real.vec3
+
+    @wp.func
+    def project(v: vec3, length: scalar) -> vec3:
+        size = wp.length(v)
+        if size > length:
+            return v * (length / size)
+        return v
+
+    return project
+
+
 def kernels(
-    real: Real, module: wp.Module, corners: int, project_of: Callable[[Real], Callable], bends: bool = True
+    real: Real,
+    module: wp.Module,
+    corners: int,
+    project_of: Callable[[Real], Callable],
+    bends: bool = True,
+    pulls: bool = False,
 ) -> SimpleNamespace:
     """Force and energy; project_of(real) makes project(G x, length), the local projection.
 
     bends: whether the projection depends on G x; without, the Hessian is w G^T G, which does not change, and no kernel is made.
+    pulls: whether what is shorter than its length is slack, as with `limit_length`.
     """
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     row = wp.types.vector(corners, scalar)
@@ -49,6 +69,7 @@ def kernels(
     project, wide_project = project_of(real), project_of(real_of("float64"))
     edges = tets.functions(real)
     wide = wp.float64
+    slackens = wp.constant(1 if pulls else 0)
 
     @wp.func
     def combined(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: element, g: row) -> vec3:
@@ -124,6 +145,8 @@ def kernels(
                 across = wp.max(scalar(0.0), across)
             h = across * h + (scalar(1.0) - across) * wp.outer(d, d)
         elif length[e] > scalar(0.0):
+            h = mat33()
+        if slackens == 1 and size < length[e]:
             h = mat33()
         at = offset + blocks * e
         for a in range(count):

@@ -572,7 +572,9 @@ class Newton:
         ranges = [(body.first, body.last) for body in simulated]
         inside = assembly.body_of_vertex < len(simulated)
         ties = np.concatenate(
-            [np.zeros((0, 2), dtype=np.int32)] + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+            [np.zeros((0, 2), dtype=np.int32)]
+            + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+            + [s.elements[:, [0, corner]] for s in assembly.stitches for corner in (1, 2, 3)]
         )
         both = inside[ties].all(axis=1)
         joined = np.unique(assembly.body_of_vertex[ties[both]], axis=0)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pdipc.scene import meshes
+from pdipc.scene import meshes, sewing
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
@@ -31,6 +31,7 @@ from pdipc.scene.schema import (
     Selection,
     Solid,
     SolidMaterial,
+    Stitch,
     VertexForce,
     Wind,
 )
@@ -94,6 +95,30 @@ class AssembledAttachment:
 
 
 @dataclass
+class AssembledStitch:
+    """Threads from the vertices elements[:, 0] to points of the triangles elements[:, 1:], (k, 4) int32, of weights (k, 3).
+
+    stiffness: N/m. distances: (k,) m at the start. length: m, what they shrink to from `start` s on within `duration` s. where: for messages.
+    """
+
+    where: str
+    elements: np.ndarray
+    weights: np.ndarray
+    stiffness: float
+    distances: np.ndarray
+    length: float
+    start: float
+    duration: float
+
+    def lengths(self, time: float) -> np.ndarray:
+        """(k,) m at `time` s; inf before the start."""
+        if time < self.start:
+            return np.full(len(self.elements), np.inf)
+        part = 1.0 if self.duration == 0.0 else min(1.0, (time - self.start) / self.duration)
+        return self.length + (1.0 - part) * np.maximum(0.0, self.distances - self.length)
+
+
+@dataclass
 class AssembledWind:
     """Wind on triangles (m, 3) int32, from start to end, s (end may be inf); see `schema.Wind` for its force."""
 
@@ -142,6 +167,7 @@ class Assembly:
     minimum_separation: float
     pins: list[AssembledPin] = field(default_factory=list)
     attachments: list[AssembledAttachment] = field(default_factory=list)
+    stitches: list[AssembledStitch] = field(default_factory=list)
     winds: list[AssembledWind] = field(default_factory=list)
     forces: list[AssembledForce] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -406,6 +432,10 @@ def gather(
         with _noting(problems):
             if _known(attachment.bodies, unread):
                 _attach(assembly, attachment, f"attachments[{number}]")
+    for number, table in zip(numbers.get("stitches", itertools.count()), scene.stitches, strict=False):
+        with _noting(problems):
+            if _known(table.bodies, unread):
+                _stitch(assembly, table, f"stitches[{number}]")
     for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
         with _noting(problems):
             if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
@@ -498,6 +528,29 @@ def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
     if table.rest_length is not None:
         lengths = np.full(len(pairs), table.rest_length)
     assembly.attachments.append(AssembledAttachment(where, vertices_a, vertices_b, table.stiffness, lengths))
+
+
+def _stitch(assembly: Assembly, table: Stitch, where: str) -> None:
+    a, b = (_body(assembly, name, where) for name in table.bodies)
+    if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
+        return  # the check says so
+    if table.within is None:
+        listed = table.points if table.points is not None else [(v, [w], [1.0]) for v, w in table.pairs or []]
+        _in_range(a, [vertex for vertex, _, _ in listed], where)
+        _in_range(b, [vertex for _, corners, _ in listed for vertex in corners], where)
+        elements, weights = sewing.named(b, [(v + a.first, [c + b.first for c in on], w) for v, on, w in listed], where)
+    else:
+        chosen = sewing.rim_vertices(a.triangles) if table.select is None else _select(assembly, a, table.select, where)
+        elements, weights = sewing.nearest(assembly.positions, a, b, chosen, table.within, table.onto == "surface")
+    x = assembly.positions[elements]
+    distances = np.linalg.norm(np.einsum("ek,ekd->ed", weights, x[:, 1:]) - x[:, 0], axis=1)
+    stiffness = table.stiffness or max(getattr(body.material, "membrane_stiffness", None) or 0.0 for body in (a, b)) or 1000.0
+    length = table.length
+    if length is None:
+        length = a.half_separation + b.half_separation + assembly.activation_distance
+    assembly.stitches.append(
+        AssembledStitch(where, elements, weights, stiffness, distances, length, table.start, table.duration)
+    )
 
 
 def _force(assembly: Assembly, table: Wind | VertexForce, where: str) -> None:

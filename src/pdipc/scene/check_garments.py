@@ -10,7 +10,10 @@ from pdipc.scene.finding import Finding
 
 
 def check_garments(assembly: Assembly) -> Iterator[Finding]:
-    """Findings about what cloths hold."""
+    """Findings about what cloths hold, and how they are sewn."""
+    for stitch in assembly.stitches:
+        if len(stitch.elements) == 0:
+            yield Finding(stitch.where, "sews no vertex", 'raise "within", or give pairs')
     for body in assembly.bodies:
         if body.inside is not None:
             yield from _closed(body)

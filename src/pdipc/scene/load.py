@@ -18,7 +18,7 @@ from pdipc.scene.vary import put
 
 BUNDLED = Path(__file__).parent.parent / "scenes"
 BYTES_PER_BYTE = 30  # of memory for a scene file: what its numbers take as Python's
-LISTS = ("bodies", "obstacles", "attachments", "forces")
+LISTS = ("bodies", "obstacles", "attachments", "stitches", "forces")
 
 
 def bundled_scenes() -> dict[str, Path]:

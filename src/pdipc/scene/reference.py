@@ -17,7 +17,7 @@ SECTIONS = {
     "The scene": (schema.Scene,),
     "Simulation and contact": (schema.Simulation, schema.Contact),
     "Bodies": (schema.Solid, schema.SolidMaterial, schema.Cloth, schema.ClothMaterial, garments.Inside, schema.Copies),
-    "Pins, selections, attachments": (schema.Pin, schema.Selection, schema.Attachment),
+    "Pins, selections, attachments, stitches": (schema.Pin, schema.Selection, schema.Attachment, schema.Stitch),
     "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe, schema.Deformation, schema.FrameArrays),
     "Forces": (schema.Wind, schema.VertexForce),
     "Pictures": (looks.Picture, looks.Look),

@@ -495,6 +495,51 @@ class Attachment(Table):
         return self
 
 
+class Stitch(Table):
+    """Threads that sew a cloth: from vertices of one body to points of another, or of another part of the same.
+
+    A thread only pulls, with stiffness (distance - length) once the distance is more than its length, which shrinks evenly from the
+    distance at the start to `length`. Contact keeps its gap all the same: sewn edges meet as near as surfaces may.
+    """
+
+    bodies: tuple[str, str] = Field(description="Names of the two bodies; the second may be an obstacle; both may be the same.")
+    pairs: list[tuple[Index, Index]] | None = Field(
+        default=None, description="Vertex of the first and of the second body, pair by pair."
+    )
+    points: list[tuple[Index, list[Index], list[NotNegative]]] | None = Field(
+        default=None,
+        description="Vertex of the first body, one to three vertices of a triangle of the second, and the weights that the point has "
+        "there, as in [7, [3, 4], [0.25, 0.75]].",
+    )
+    within: Positive | None = Field(
+        default=None,
+        description="Sew each vertex of `select` to the nearest point `onto` the second body that is no further than this, m.",
+    )
+    select: Selection | None = Field(
+        default=None, description="Which vertices of the first body `within` sews; absent: those on its rim."
+    )
+    onto: Literal["rim", "surface"] = Field(
+        default="rim", description="What `within` sews to: open edges of the second body, or any point of it."
+    )
+    stiffness: Positive | None = Field(
+        default=None, description="Of each thread, N/m; absent: the larger membrane stiffness of the two bodies."
+    )
+    length: NotNegative | None = Field(
+        default=None,
+        description="Length of the threads in the end, m; absent: the gap at which contact lets go, minimum separation and activation "
+        "distance together. Below that, threads press the edges against each other's barrier.",
+    )
+    start: NotNegative = Field(default=0.0, description="When sewing begins, s; before, threads are loose.")
+    duration: NotNegative = Field(default=0.0, description="How long it takes, s; 0: threads have their length at once.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Stitch":
+        _exactly_one(self, "pairs", "points", "within")
+        if self.within is None and (self.select is not None or self.onto != "rim"):
+            raise ValueError("select and onto have no effect without within")
+        return self
+
+
 # --- bodies and obstacles ---
 
 
@@ -643,6 +688,7 @@ class Scene(Table):
     bodies: list[Annotated[Solid | Cloth, Field(discriminator="kind")]] = Field(min_length=1, description="What is simulated.")
     obstacles: list[Obstacle] = Field(default=[], description="Rigid surfaces, static or scripted.")
     attachments: list[Attachment] = Field(default=[], description="Springs between bodies.")
+    stitches: list[Stitch] = Field(default=[], description="Threads that sew cloth.")
     forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field(default=[], description="Beyond gravity.")
     picture: Picture = Field(default_factory=Picture, description="How runs are drawn.")
 
