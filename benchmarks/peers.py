@@ -46,11 +46,13 @@ def scene_of(name: str):
 def describe(name: str, steps: int, substeps: int) -> dict[str, np.ndarray]:
     """Meshes, materials and scripted positions of a scene, as flat arrays."""
     from pdipc.model import build
+    from pdipc.scene.movers import movers_of
 
     model = build(scene_of(name), "cpu")
     assembly, bodies = model.assembly, []
     times = H / substeps * np.arange(1, steps * substeps + 1)
     held = assembly.kinematic_vertices
+    moves = any(not mover.still for mover in movers_of(assembly))
     arrays = {
         "x": assembly.positions,
         "v": assembly.velocities,
@@ -58,7 +60,7 @@ def describe(name: str, steps: int, substeps: int) -> dict[str, np.ndarray]:
         "scripted": assembly.scripted,
         "obstacle": assembly.obstacle,
         "held": held,
-        "targets": np.array([assembly.kinematic_positions(t) for t in times]) if model.moves else np.zeros((0, len(held), 3)),
+        "targets": np.array([assembly.kinematic_positions(t) for t in times]) if moves else np.zeros((0, len(held), 3)),
         "activation_distance": np.array(assembly.activation_distance),
         "friction": np.array(model.scene.contact.friction),
     }

@@ -46,7 +46,7 @@ def audit(model: Model, state: State, work: Work) -> Audit:
     elastic, barrier = (float(value) for value in numbers.numpy())
     mass = model.external.mass[:, None]
     x, v = state.positions.numpy().astype(np.float64), state.velocities.numpy().astype(np.float64)
-    gravity = np.asarray(model.scene.simulation.gravity)
+    gravity = work.loads.external.gravity[0]
     return Audit(
         time=state.time,
         kinetic=0.5 * float((mass * v * v).sum()),

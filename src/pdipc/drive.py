@@ -8,7 +8,7 @@ import warp as wp
 from pdipc import algorithm
 from pdipc.device.launch import one_at_a_time
 from pdipc.forces import ContactForces
-from pdipc.integration.inertia import FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
+from pdipc.integration.inertia import CHORDS, FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
 from pdipc.model import Model, State
 from pdipc.nonlinear import status
@@ -26,7 +26,7 @@ class StepResult:
     force_residual: N, the largest force on a free vertex that was left at the start of the last outer iteration, and force_scale, N, the
     largest force of inertia to compare it with; 0 for other methods than Newton's.
     lag: m, how far something scripted is behind where it should be. searches: outer iterations that were turned back because
-    the potential rose. forces: of contact, where `Simulation.step` was asked for them. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
+    the potential rose. chords: in how many straight pieces what turns was led, at most. forces: of contact, where `Simulation.step` was asked for them. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
     CCD), barrier, misc.
     """
 
@@ -43,6 +43,7 @@ class StepResult:
     smallest_gap: float
     milliseconds: dict[str, float] = field(default_factory=dict)
     searches: int = 0
+    chords: int = 0
     lag: float = 0.0
     force_residual: float = 0.0
     force_scale: float = 0.0
@@ -72,7 +73,7 @@ def step(
     _belongs(model, state, work)
     work.foreign.zero_()
     model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
-    work.set_scripted(state, state.time + model.settings.time_step)
+    work.set_scripted(state)
     if state.step % RESTRUCTURE_EVERY == 0:
         work.candidates.restructure(state.positions)
     while True:
@@ -101,10 +102,11 @@ def step(
         for motion in motions:
             observe(*motion)
     s, code, outer = model.settings, int(report[status.STATUS]), int(report[status.OUTER])
-    lag = report[FIRST_NUMBER + status.LAG]
-    behind = f"something scripted is {lag:.3g} m behind its target, where something is in its way"
+    time, number = state.time + s.time_step, state.step + 1
+    reached, lag, why = work.script.settle(time, state.reached, report[FIRST_NUMBER + status.LAG], work.x)
+    behind = f"something scripted is {lag:.3g} m behind its target, {why}" if lag > 0.0 else ""
     message = {
-        status.CONVERGED: "",
+        status.CONVERGED: behind,
         status.LAGGING: behind,
         status.CAPPED: f"the cap of {s.max_outer} outer iterations ended the step",
         status.OUT_OF_TIME: f"the time budget of {s.budget_ms or 0.0:g} ms ended the step after {outer} outer iterations",
@@ -113,13 +115,12 @@ def step(
     }[code]
     if lag > 0.0 and code not in (status.LAGGING, status.CONVERGED):
         message += f"; {behind}"
-    time, number = state.time + s.time_step, state.step + 1
-    new = into or State(*(wp.empty_like(each) for each in (work.x, work.v, work.a, work.rest)))
+    new = into or State(*(wp.empty_like(each) for each in (work.x, work.v, work.a, work.rest)), reached)
     wp.copy(new.positions, work.x)
     wp.copy(new.velocities, work.v)
     wp.copy(new.accelerations, work.a)
     wp.copy(new.remainders, work.rest_end)
-    new.time, new.step = time, number
+    new.reached, new.time, new.step = reached, time, number
     return StepResult(
         state=new,
         converged=code in (status.CONVERGED, status.LAGGING),
@@ -134,6 +135,7 @@ def step(
         smallest_gap=report[GAP],
         milliseconds=dict(zip(status.STAGES, report[TIMES:], strict=True)),
         searches=int(report[status.SEARCHES]),
+        chords=int(report[CHORDS]),
         lag=lag,
         force_residual=report[FIRST_NUMBER + status.FORCE],
         force_scale=report[FIRST_NUMBER + status.FORCE_SCALE],

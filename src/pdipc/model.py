@@ -23,6 +23,7 @@ from pdipc.constraints import (
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
 from pdipc.integration.loads import ExternalForces
+from pdipc.integration.script import Reached
 from pdipc.linear.solver import Solver
 from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
@@ -44,13 +45,15 @@ class State:
     """Positions, velocities and accelerations of all n vertices at one time.
 
     positions: (n,) vec3, m. velocities: (n,) vec3, m/s. accelerations: (n,) vec3, m/s^2. remainders: (n,) vec3, m, what rounding
-    took off the positions when they were stored: motions smaller than that add up. time: s. step: steps done.
+    took off the positions when they were stored: motions smaller than that add up. reached: how far obstacles have come, on the host.
+    time: s. step: steps done.
     """
 
     positions: wp.array
     velocities: wp.array
     accelerations: wp.array
     remainders: wp.array
+    reached: Reached
     time: float = 0.0
     step: int = 0
 
@@ -63,6 +66,7 @@ class State:
             velocities=wp.clone(self.velocities),
             accelerations=wp.clone(self.accelerations),
             remainders=wp.clone(self.remainders),
+            reached=self.reached.copy(),
         )
 
     def __deepcopy__(self, memo: dict) -> "State":
@@ -76,6 +80,9 @@ class State:
             "velocities": self.velocities.numpy().copy(),
             "accelerations": self.accelerations.numpy().copy(),
             "remainders": self.remainders.numpy().copy(),
+            "reached_times": self.reached.times.copy(),
+            "reached_poses": self.reached.poses.copy(),
+            "reached_anchors": self.reached.anchors.copy(),
             "time": np.float64(self.time),
             "step": np.int64(self.step),
         }
@@ -109,7 +116,7 @@ class Model:
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
     solver: of the local-global method, else None. free_vertices: (n,) bool; held: (n,) kg/s^2, what a common motion of all costs each:
-    mass over h^2, damping, attachments to points. rigid: vertex ranges of the obstacles that move without deforming. triangles: (m, 3) int32, all surfaces.
+    mass over h^2, damping, attachments to points. external: what the scene says; each simulation has a copy. triangles: (m, 3) int32, all surfaces.
     """
 
     scene: Scene
@@ -131,7 +138,6 @@ class Model:
     held: np.ndarray
     surface: surface.Surface
     external: ExternalForces
-    rigid: list[tuple[int, int]]
     triangles: np.ndarray
 
     @property
@@ -169,33 +175,22 @@ class Model:
 
         arrays = {"remainders": np.zeros_like(arrays["positions"]), **arrays}  # files of earlier versions have none
         vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
-        return State(*vectors, time=float(arrays["time"]), step=int(arrays.get("step", 0)))
+        time = float(arrays["time"])
+        reached = Reached.at(time, self.assembly)
+        if "reached_times" in arrays:
+            reached = Reached(*(np.array(arrays[f"reached_{name}"]) for name in ("times", "poses", "anchors")))
+        return State(*vectors, reached, time=time, step=int(arrays.get("step", 0)))
 
     def set_time(self, time: float) -> None:
-        """Uploads what a script says of `time`, s: where the points of soft pins are, how long threads are, and what closed sheets hold."""
-        soft = [pin for pin in self.assembly.pins if pin.stiffness is not None and len(pin.vertices)]
-        if self.projector.anchors is not None:
-            self.projector.anchors.assign(np.concatenate([self.assembly.pin_targets(pin, time) for pin in soft]))
+        """Uploads what a script says of `time`, s: how long threads are, and what closed sheets hold."""
         if self.projector.threads is not None:
             self.projector.threads.assign(cloth.thread_lengths(self.assembly, time))
         if self.projector.cavities is not None:
             self.projector.cavities.laws.assign(self._fillings.laws(time))
 
     @functools.cached_property
-    def moves(self) -> bool:
-        """Whether any kinematic vertex follows a motion."""
-        a = self.assembly
-        scripted = [body.trajectory for body in a.bodies if body.trajectory] + [pin.trajectory for pin in a.pins]
-        return any(not trajectory.is_static for trajectory in scripted)
-
-    @functools.cached_property
     def _fillings(self) -> cloth.Fillings:
         return cloth.Fillings(self.assembly)
-
-    @functools.cached_property
-    def changes(self) -> bool:
-        """Whether anything that acts on bodies changes with time by a script."""
-        return self.moves or bool(self.assembly.stitches) or any(body.inside is not None for body in self.assembly.bodies)
 
     def kinematic_targets(self, time: float) -> np.ndarray:
         """(n, 3) m: where the kinematic vertices are at `time`; the start for all others."""
@@ -297,9 +292,6 @@ def build(scene: Scene, device: str | None = None) -> Model:
         held=held,
         surface=skin,
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
-        rigid=[
-            (b.first, b.last) for b in assembly.bodies if b.trajectory and b.trajectory.is_rigid and not b.trajectory.is_static
-        ],
         triangles=assembly.triangles,
     )
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from pdipc.control import Controls
 from pdipc.device.launch import one_at_a_time
 from pdipc.drive import StepResult, Work, step
 from pdipc.forces import collect, mean
@@ -42,8 +43,8 @@ class StepInfo:
     result: StepResult
 
 
-class Simulation:
-    """A scene in motion: a model, its state and its buffers.
+class Simulation(Controls):
+    """A scene in motion: a model, its state and its buffers; and between steps, what leads obstacles, pins and bodies (`Controls`).
 
     device: "cpu", "cuda:0", or None for the scene's choice. observe(x, x_end): see `pdipc.drive.step`.
     state: the current one, whose arrays every step overwrites (`state.copy()` keeps it).
@@ -71,26 +72,6 @@ class Simulation:
         """(m, 3) int32: the surface of every body and obstacle."""
         return self.model.triangles
 
-    def set_vertex_force(self, vertices: np.ndarray, forces: np.ndarray) -> None:
-        """Pulls the given vertices (k,) with forces (k, 3) in newtons from the next step on, in place of earlier ones.
-
-        Raises ValueError for vertices that are not simulated, forces that are no finite numbers, or lengths that differ.
-        """
-        vertices, forces = np.asarray(vertices), np.asarray(forces, dtype=np.float64)
-        if vertices.size and vertices.dtype.kind not in "iu":
-            raise ValueError(f"vertices are {vertices.dtype}; they must be whole numbers")
-        vertices = vertices.astype(np.int64)
-        if vertices.ndim != 1 or forces.shape != (len(vertices), 3):
-            raise ValueError(f"{vertices.shape} vertices and {forces.shape} forces; they must be (k,) and (k, 3)")
-        scripted = self.model.assembly.scripted
-        if len(unknown := vertices[(vertices < 0) | (vertices >= len(scripted))]):
-            raise ValueError(f"there is no vertex {unknown[0]}; vertices are 0 to {len(scripted) - 1}")
-        if len(held := vertices[scripted[vertices]]):
-            raise ValueError(f"vertex {held[0]} follows a script and cannot be pulled")
-        if len(wrong := np.flatnonzero(~np.isfinite(forces).all(axis=1))):
-            raise ValueError(f"the force on vertex {vertices[wrong[0]]} is {forces[wrong[0]].tolist()}; it must be finite")
-        self.model.external.pulled = (vertices, forces)
-
     @one_at_a_time
     def step(self, forces: bool = False) -> StepResult:
         """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them.
@@ -109,8 +90,9 @@ class Simulation:
 
     @one_at_a_time
     def reset(self) -> None:
-        """Back to the start, with no vertex pulled."""
-        self.set_vertex_force(np.zeros(0), np.zeros((0, 3)))
+        """Back to the start, with no command."""
+        self.work.follow({})
+        self.work.loads.reset()
         self.state = self.model.initial_state()
         wp.copy(self.work.x, self.state.positions)  # the start was judged when the model was built
         self.work.candidates.invalidate()

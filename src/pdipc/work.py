@@ -13,6 +13,7 @@ from pdipc.device import system
 from pdipc.device.launch import Graph, one_at_a_time
 from pdipc.integration import inertia
 from pdipc.integration.loads import Loads
+from pdipc.integration.script import Lead, Script
 from pdipc.model import Model, State
 from pdipc.nonlinear import Method, status
 from pdipc.nonlinear.local_global import LocalGlobal
@@ -26,7 +27,7 @@ class Work:
     """What a step works with. Arrays over all n vertices, on the device:
 
     x_start, rest, v_start, a_start: where the step starts, m, m/s, m/s^2; rest is what rounding took off x_start.
-    target: where kinematic vertices go, m. z: the inertial displacement of line 1, m.
+    script: where kinematic vertices go. loads: external accelerations. z: the inertial displacement of line 1, m.
     u, x: the feasible iterate as displacement from x_start, with rest, and as position x = x_start + u, m. u_tilde, x_tilde: where the
     outer iteration wants to go. v, a: the result.
 
@@ -50,7 +51,8 @@ class Work:
         self.x_start, self.rest, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
         self.x, self.v, self.a, self.rest_end = model.initial_state().positions, zeros(vec3), zeros(vec3), zeros(vec3)
         self.u, self.u_tilde, self.x_tilde, self.z = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
-        self.target, self.loads = zeros(vec3), Loads(device, real, model.external)
+        self.script = Script(model.assembly, device, real, settings.time_step)
+        self.loads = Loads(device, real, model.external)
         self.count, self.going, self.foreign = zeros(wp.int32, status.COUNTS), zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(status.STAGES) + 2)
         self.report = zeros(wp.float64, inertia.SIZE)
@@ -65,36 +67,51 @@ class Work:
             settings.activation_distance,
             settings.margin,
         )
-        self.truncation = Truncation(device, real, n, model.rigid, settings.per_vertex_truncation)
+        self.truncation = Truncation(device, real, n, settings.per_vertex_truncation)
+        self.truncation.keep_rigid(self.script.rigid())
         self.method: Method = METHODS[settings.nonlinear_solver](self)
         self.restitution = None
         if settings.restitution is not None and settings.method == "barrier":
             masses = (model.mass, model.free, model.body_mass, model.rigidity)
             self.restitution = Restitution(device, real, self.method.pairs, *masses, settings.restitution, settings.time_step)
         self._graphs: dict[str, Graph] = {}
-        self._graphs_of: tuple[int, int] = (-1, -1)
-        self._scripted = False
+        self._graphs_of = (-1, -1, -1)
 
     @property
     def pairs(self):
         """The barriers that were listed last."""
         return self.method.pairs
 
-    def set_scripted(self, state: State, time: float) -> None:
-        """Where kinematic vertices go by `time`, only uploaded where they move, and the external accelerations."""
-        model = self.model
-        if not self._scripted or model.changes:
-            self.target.assign(model.kinematic_targets(time))
-            model.set_time(time)
+    def set_scripted(self, state: State) -> None:
+        """Where kinematic vertices go in a step from `state`, only uploaded where they move, and the external accelerations."""
+        self.script.plan(state.time, state.reached, state.positions)
+        if self.script.anchors is not None and self.model.projector.anchors is not None:
+            self.model.projector.anchors.assign(self.script.anchors)
+        self.model.set_time(state.time + self.model.settings.time_step)
         self.loads.update(state.time, state.positions, state.velocities)
-        self._scripted = True
+
+    def lead(self, number: int, lead: Lead) -> None:
+        """A mover of the script follows a command from the next step on."""
+        self.follow({**self.script.leads, number: lead})
+
+    def lead_pin(self, pin: int, lead: Lead) -> None:
+        """As `lead`, for a pin of the assembly."""
+        self.lead(self.script.number_of_pin(pin), lead)
+
+    def follow(self, leads: dict[int, Lead]) -> None:
+        """These commands, and no others, from the next step on."""
+        before = self.script.moves, [vertices[0] for vertices in self.script.rigid()]
+        self.script.leads = leads
+        if before != (self.script.moves, [vertices[0] for vertices in self.script.rigid()]):
+            self.truncation.keep_rigid(self.script.rigid())
+            self.script.generation += 1
 
     def run(self, part: Callable[["Work"], None]) -> None:
         """Replays `part` of Algorithm 1; records it first where it is new or arrays were replaced."""
         if not self.recorded:
             part(self)
             return
-        generation = (self.candidates.generation, self.method.generation)
+        generation = (self.candidates.generation, self.method.generation, self.script.generation)
         if self._graphs_of != generation:
             self._graphs, self._graphs_of = {}, generation
         name = part.__name__
@@ -132,7 +149,16 @@ class Work:
     def predict(self) -> None:
         """Lines 1 and 2: z and x~, as displacements."""
         self.device.copy(self.x, self.x_start)
-        start = [self.x_start, self.rest, self.v_start, self.a_start, self.loads.acceleration, self.target, self.model.free]
+        self.script.begin(self.x_start)
+        start = [
+            self.x_start,
+            self.rest,
+            self.v_start,
+            self.a_start,
+            self.loads.acceleration,
+            self.script.target,
+            self.model.free,
+        ]
         self.device.launch(self.kernels.predict, self.model.vertex_count, [*start, self.h, self.u, self.z, self.u_tilde])
 
     def rebound(self) -> None:
@@ -160,5 +186,5 @@ class Work:
     def write_report(self) -> None:
         """What the host reads when the step is over."""
         m = self.method
-        numbers = [self.count, m.inner, m.iterations, m.numbers, m.pairs.closest, self.foreign, self.clock]
+        numbers = [self.count, m.inner, m.iterations, m.numbers, m.pairs.closest, self.foreign, self.script.chords, self.clock]
         self.device.launch_serial(self.kernels.report, [*numbers, self.report])

@@ -24,8 +24,10 @@ def truncated(motion, *, truncation="per_vertex", precision="float64", moving_fl
     """Truncates x + motion(x, model): model, x, x~, x_end (n, 3) and the kept fractions."""
     model = pdipc.build(falling(truncation, precision), "cpu")
     if moving_floor:
-        model.rigid = [(b.first, b.last) for b in model.assembly.bodies if b.kinematic]
+        (moving,) = (b for b in model.assembly.bodies if b.kinematic)
     work, x = Work(model), model.initial_state().positions
+    if moving_floor:
+        work.truncation.keep_rigid([np.arange(moving.first, moving.last)])
     start = x.numpy()
     wanted = wp.array(motion(start, model), dtype=model.real.vec3, device="cpu")
     x_tilde = wp.array(start + wanted.numpy(), dtype=model.real.vec3, device="cpu")

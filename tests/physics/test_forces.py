@@ -32,11 +32,11 @@ def test_loads_are_those_of_the_formulas(precision, tolerance):
     seen = []
     for time, pull in pulls.items():
         vertices, size = (pull or ([], 0.0))[:2]
-        model.external.pulled = (np.array(vertices, dtype=np.int64), size * rng.standard_normal((len(vertices), 3)))
+        loads.external.pulled = (np.array(vertices, dtype=np.int64), size * rng.standard_normal((len(vertices), 3)))
         x = (model.assembly.positions + 0.05 * rng.standard_normal((model.vertex_count, 3))).astype(model.real.numpy)
         v = rng.standard_normal(x.shape).astype(model.real.numpy)
         loads.update(time, *(wp.array(each, dtype=model.real.vec3, device="cpu") for each in (x, v)))
-        expected = model.external.accelerations(time, x.astype(np.float64), v.astype(np.float64))
+        expected = loads.external.accelerations(time, x.astype(np.float64), v.astype(np.float64))
         np.testing.assert_allclose(loads.acceleration.numpy(), expected, atol=tolerance * np.abs(expected).max())
         seen.append(np.abs(expected - model.external.gravity).max())
     assert min(seen) > 0.1  # some wind or force acts at each time
@@ -147,7 +147,7 @@ def test_a_force_that_is_no_number_ends_the_step_where_it_began():
     """Should one arise in spite of all, the step says so and keeps the last state."""
     simulation = pdipc.Simulation(scene([solid("block", [0.1, 0.1, 0.1], [2, 2, 2], at=(0, 1, 0))]), "cpu")
     before = simulation.positions
-    simulation.model.external.pulled = (np.array([3]), np.array([[0.0, np.nan, 0.0]]))
+    simulation.work.loads.external.pulled = (np.array([3]), np.array([[0.0, np.nan, 0.0]]))
     result = simulation.step()
     assert not result.converged
     assert "not finite" in result.message

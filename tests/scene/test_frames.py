@@ -179,7 +179,7 @@ def test_a_cloth_is_lifted_by_a_hump_that_rises_and_never_meets_it():
         assert not len(pdipc.find_intersections(sim.positions, sim.triangles, obstacle))
     assert sim.positions[obstacle] == pytest.approx(FRAMES[-1], abs=1e-6), "nothing was in its way"
     assert 0.3 < sim.positions[~obstacle, 1].max() < 0.32
-    assert sim.model.rigid == []
+    assert sim.work.script.rigid() == []
 
 
 def test_a_run_with_a_cache_resumes_to_the_same_bits(tmp_path):

@@ -7,7 +7,7 @@ committed.
 
 **Lemma (the last pass).** After it no two primitives come nearer than xi while all vertices move from x to x_end. Proof: x_end are the float
 positions that are committed, and CCD was asked about just these. A pair that has a shortened vertex is asked in every pass, if it
-is listed; a pair without one makes the motion of the first pass, where it was not hit, or all its vertices would be shortened; it was
+is listed; a pair without one makes the motion of the first pass, where it was not hit, or some of its vertices would be shortened; it was
 listed there, or proven apart all the way. A pair that is not listed is apart by the lemmas of `candidates`, since the list was made for
 this motion or one that `check` compared with it. Whatever shortens a vertex (a pair's time, its neighbours, a line search that begins at a
 later pass) leaves a fraction below 1. Where the passes do not settle nobody moves: x_end = base + u, which is x to the bit, and feasible.
@@ -41,7 +41,7 @@ MAX_PASSES = 60  # and after which all do
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
+    scalar, vec2, vec3, vec4 = real.scalar, real.vec2, real.vec3, real.vec4
     module = real.module(__name__)
     c, dist = ccd.functions(real), distance.functions(real)
     unit = wp.constant(UNIT)
@@ -118,34 +118,65 @@ def kernels(real: Real) -> SimpleNamespace:
     def clear(first: int, values_out: wp.array(dtype=wp.int32)):
         values_out[first + wp.tid()] = 0
 
-    @wp.kernel(module=module)
-    def spread(
-        span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        times: wp.array(dtype=wp.int32),
-        hits: wp.array(dtype=wp.int32),
-        multiplier: wp.array(dtype=wp.int32),
-        any_hit: wp.array(dtype=wp.int32),
-    ):
-        worker = span.first + wp.tid()
-        for begin in range(worker * span.block, count[0], span.step * span.block):
-            if hits[begin // span.block] > 0:
-                any_hit[0] = 1
-                for k in range(begin, wp.min(begin + span.block, count[0])):
-                    if times[k] < unit:
-                        for s in range(4):
-                            wp.atomic_min(multiplier, quads[k][s], times[k])
+    def spread(kind: str):
+        edge_edge = kind == "edge_edge"
+
+        @kernel(module, f"spread_{kind}")
+        def spread_times(
+            span: Span,
+            count: wp.array(dtype=wp.int32),
+            x: wp.array(dtype=vec3),
+            x_end: wp.array(dtype=vec3),
+            rigid: wp.array(dtype=wp.int32),
+            passes: wp.array(dtype=wp.int32),
+            quads: wp.array(dtype=wp.vec4i),
+            times: wp.array(dtype=wp.int32),
+            hits: wp.array(dtype=wp.int32),
+            multiplier: wp.array(dtype=wp.int32),
+            any_hit: wp.array(dtype=wp.int32),
+        ):
+            """The vertices of a pair that is hit are shortened; but an obstacle that withdraws is not held by what comes after it."""
+            worker = span.first + wp.tid()
+            for begin in range(worker * span.block, count[0], span.step * span.block):
+                if hits[begin // span.block] > 0:
+                    any_hit[0] = 1
+                    for k in range(begin, wp.min(begin + span.block, count[0])):
+                        if times[k] < unit:
+                            q = quads[k]
+                            withdraws = int(0)
+                            if passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
+                                a = vec4()
+                                if wp.static(edge_edge):
+                                    a = dist.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                else:
+                                    a = dist.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                apart = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
+                                away = scalar(0.0)
+                                for s in range(4):
+                                    if rigid[q[s]] != 0:
+                                        away += a[s] * wp.dot(apart, x_end[q[s]] - x[q[s]])
+                                if away >= scalar(0.0):
+                                    withdraws = 1
+                            for s in range(4):
+                                if withdraws == 0 or rigid[q[s]] == 0:
+                                    wp.atomic_min(multiplier, q[s], times[k])
+
+        return spread_times
 
     @wp.kernel(module=module)
-    def together(first: int, begin: wp.array(dtype=int), end: wp.array(dtype=int), multiplier: wp.array(dtype=wp.int32)):
+    def together(
+        first: int,
+        ends: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        multiplier: wp.array(dtype=wp.int32),
+    ):
         """Vertices of a rigid obstacle keep one time, so that it stays rigid."""
         r = first + wp.tid()
         least = unit
-        for i in range(begin[r], end[r]):
-            least = wp.min(least, multiplier[i])
-        for i in range(begin[r], end[r]):
-            multiplier[i] = least
+        for k in range(ends[r], ends[r + 1]):
+            least = wp.min(least, multiplier[members[k]])
+        for k in range(ends[r], ends[r + 1]):
+            multiplier[members[k]] = least
 
     @wp.kernel(module=module)
     def shorten(
@@ -247,7 +278,8 @@ def kernels(real: Real) -> SimpleNamespace:
         sweep_edge_edge=sweep("edge_edge"),
         reset=reset,
         clear=clear,
-        spread=spread,
+        spread_vertex_triangle=spread("vertex_triangle"),
+        spread_edge_edge=spread("edge_edge"),
         together=together,
         shorten=shorten,
         grade=grade,
@@ -260,27 +292,38 @@ def kernels(real: Real) -> SimpleNamespace:
 class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
-    rigid: (first, last) vertex ranges of obstacles that must stay rigid. neighbours: offsets (n + 1,) and columns of those that elasticity
+    neighbours: offsets (n + 1,) and columns of those that elasticity
     connects, or None. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
     set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
     that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
-    def __init__(self, device: Device, real: Real, n: int, rigid: list[tuple[int, int]], per_vertex: bool = True):
+    def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True):
         self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
         self.kernels = kernels(real)
         self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
         self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
-        ranges = rigid if per_vertex else [(0, n)]
         self.body_count = 0
         self.body = wp.full(n, -1, dtype=wp.int32, device=device.warp)
         self.deep = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.neighbours: list[wp.array] | None = None
         self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.rigid_begin = wp.array(np.array([first for first, _ in ranges], dtype=np.int32), device=device.warp)
-        self.rigid_end = wp.array(np.array([last for _, last in ranges], dtype=np.int32), device=device.warp)
+        self.keep_rigid([])
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
+
+    def keep_rigid(self, groups: list[np.ndarray]) -> None:
+        """Vertices (k,) of each obstacle that must stay rigid: these share one time. What was recorded has to be recorded again."""
+        rigid = np.zeros(self.n, dtype=np.int32)
+        if self.per_vertex and groups:
+            rigid[np.concatenate(groups)] = 1
+        self.rigid = wp.array(rigid, device=self.device.warp)
+        groups = groups if self.per_vertex else [np.arange(self.n)]
+        ends = np.cumsum([0, *map(len, groups)]).astype(np.int32)
+        self.group_count = len(groups)
+        self.group_ends = wp.array(ends, device=self.device.warp)
+        members = np.concatenate([np.zeros(0), *groups, np.zeros(1)]).astype(np.int32)
+        self.group_members = wp.array(members, device=self.device.warp)
 
     def truncate(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
         """Fills u_end, x_end = base + u_end and `passes`, the number of passes that found hits: 0 where the whole motion is free.
@@ -316,14 +359,25 @@ class Truncation:
                     self.deep,
                 ]
                 device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
-                inputs = [c.count, c.quads, c.times, c.found, self.multiplier, self.any_hit]
-                device.launch_scatter(k.spread, c.capacity, inputs)
+                inputs = [
+                    c.count,
+                    x,
+                    self.x_end,
+                    self.rigid,
+                    self.passes,
+                    c.quads,
+                    c.times,
+                    c.found,
+                    self.multiplier,
+                    self.any_hit,
+                ]
+                device.launch_scatter(getattr(k, f"spread_{c.kind}"), c.capacity, inputs)
             device.when(self.any_hit, shorten)
             device.launch_serial(k.decide, [self.any_hit, self.passes, self.going])
 
         def shorten() -> None:
-            if len(self.rigid_begin):
-                device.launch(k.together, len(self.rigid_begin), [self.rigid_begin, self.rigid_end, self.multiplier])
+            if self.group_count:
+                device.launch(k.together, self.group_count, [self.group_ends, self.group_members, self.multiplier])
             device.launch(k.shorten, n, [self.multiplier, self.passes, self.fraction, self.first_fraction])
             if self.neighbours is not None:
                 for _ in range(RINGS // 2):

@@ -10,9 +10,9 @@ from pdipc.device.precision import Real
 from pdipc.nonlinear import status
 
 # What a step reports after its counts, in one array that the host reads once: iterations, numbers, gap, then the stages' times.
-LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, FIRST_NUMBER = (wp.constant(status.COUNTS + place) for place in range(5))
-TIMES = wp.constant(status.COUNTS + 4 + status.NUMBERS)
-SIZE = status.COUNTS + 4 + status.NUMBERS + len(status.STAGES)
+LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, CHORDS, FIRST_NUMBER = (wp.constant(status.COUNTS + place) for place in range(6))
+TIMES = wp.constant(status.COUNTS + 5 + status.NUMBERS)
+SIZE = status.COUNTS + 5 + status.NUMBERS + len(status.STAGES)
 
 
 @functools.cache
@@ -114,6 +114,7 @@ def kernels(real: Real) -> SimpleNamespace:
         numbers: wp.array(dtype=scalar),
         closest: wp.array(dtype=scalar),
         foreign: wp.array(dtype=wp.int32),
+        chords: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wp.float64),
         report_out: wp.array(dtype=wp.float64),
     ):
@@ -122,6 +123,7 @@ def kernels(real: Real) -> SimpleNamespace:
         report_out[LOCAL_GLOBAL] = wp.float64(local_global[0])
         report_out[LINEAR] = wp.float64(linear[0])
         report_out[FOREIGN] = wp.float64(foreign[0])
+        report_out[CHORDS] = wp.float64(chords[0])
         report_out[GAP] = wp.float64(wp.inf)
         if count[status.BARRIERS] > 0:
             report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))

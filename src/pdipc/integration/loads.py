@@ -13,6 +13,7 @@ three corners, summed over triangles, which as a diagonal matrix G bounds. F / (
 weaken the drag on a sail that is held in any wind.
 """
 
+import copy
 import functools
 from types import SimpleNamespace
 
@@ -55,13 +56,19 @@ def vertex_force(force: AssembledForce, count: int, time: float) -> np.ndarray:
 class ExternalForces:
     """All external forces of an assembly. gravity: (3,) m/s^2; mass: (n,) kg, 0 for kinematic vertices; h: length of a step, s.
 
-    pulled: vertices (k,) and forces (k, 3) N that a user applies by hand; replace it between steps.
+    winds: those of the assembly, whose velocities may be others. pulled: vertices (k,) and forces (k, 3) N that a user applies by hand.
+    To change one between steps, replace it: what is replaced is uploaded.
     """
 
     def __init__(self, assembly: Assembly, gravity: np.ndarray, mass: np.ndarray, h: float):
         self.assembly, self.mass, self.h = assembly, mass, h
-        self.gravity = np.tile(np.asarray(gravity, dtype=np.float64), (len(mass), 1))
+        self.set_gravity(gravity)
+        self.winds = assembly.winds
         self.pulled: tuple[np.ndarray, np.ndarray] = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+
+    def set_gravity(self, acceleration: np.ndarray) -> None:
+        """acceleration: (3,) m/s^2, of every body."""
+        self.gravity = np.tile(np.asarray(acceleration, dtype=np.float64), (len(self.mass), 1))
 
     def acting(self, time: float) -> list[int]:
         """Which of the forces on vertices act at `time`."""
@@ -79,7 +86,7 @@ class ExternalForces:
     def accelerations(self, time: float, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         """(n, 3) m/s^2 for a step from the given state, time in s."""
         force, rate = np.zeros_like(self.gravity), np.zeros(len(self.mass))
-        for wind in self.assembly.winds:
+        for wind in self.winds:
             each, its_rate = wind_drag(wind, positions, velocities, time)
             force += each
             rate += its_rate
@@ -157,10 +164,13 @@ class Loads:
     """
 
     def __init__(self, device: Device, real: Real, external: ExternalForces):
-        self.device, self.real, self.external, self._kernels = device, real, external, kernels(real)
-        n, winds = len(external.mass), external.assembly.winds
+        self.device, self.real, self._kernels = device, real, kernels(real)
+        self._scene = external
+        self.external = copy.copy(external)  # what a user changes here is not changed for others
+        n, winds = len(external.mass), external.winds
         self.acceleration = wp.zeros(n, dtype=real.vec3, device=device.warp)
-        self._uploaded: tuple[list[int], tuple] | None = None
+        self._uploaded: tuple | None = None
+        self._blows = winds
         self._count = sum(len(wind.triangles) for wind in winds)
         self._steady = self.acceleration
         if not self._count:
@@ -169,7 +179,7 @@ class Loads:
         def upload(values: np.ndarray, dtype) -> wp.array:
             return wp.array(values, dtype=dtype, device=device.warp)
 
-        sizes = [len(wind.triangles) for wind in winds]
+        self._sizes = sizes = [len(wind.triangles) for wind in winds]
         triangles = np.concatenate([wind.triangles for wind in winds]).astype(np.int32)
         windows = np.repeat([[wind.start, wind.end] for wind in winds], sizes, axis=0)
         air = np.repeat([wind.velocity for wind in winds], sizes, axis=0)
@@ -184,13 +194,22 @@ class Loads:
         self._incident = [upload(starts.astype(np.int32), wp.int32), upload((order // 3).astype(np.int32), wp.int32)]
         self._inertia = upload(external.inertia.astype(real.numpy), real.scalar)
 
+    def reset(self) -> None:
+        """Back to what the scene says."""
+        self.external = copy.copy(self._scene)
+
     def update(self, time: float, x: wp.array, v: wp.array) -> None:
         """Launches the accelerations at positions x and velocities v, (n,) vec3, at `time`, s."""
         external = self.external
         acting = external.acting(time)
-        if self._uploaded is None or self._uploaded[0] != acting or self._uploaded[1] is not external.pulled:
+        last = self._uploaded
+        if last is None or last[0] != acting or last[1] is not external.pulled or last[2] is not external.gravity:
             self._steady.assign(external.steady(time).astype(self.real.numpy))
-            self._uploaded = acting, external.pulled
+            self._uploaded = acting, external.pulled, external.gravity
+        if self._blows is not external.winds:
+            air = np.repeat([wind.velocity for wind in external.winds], self._sizes, axis=0)
+            self._triangles[2].assign(air.astype(self.real.numpy))
+            self._blows = external.winds
         if self._count:
             inputs = [wp.float64(time), *self._triangles, x, v, *self._drag]
             self.device.launch(self._kernels.drag, self._count, inputs, grain=16)

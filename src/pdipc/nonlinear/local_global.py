@@ -9,6 +9,7 @@ from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
+from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear import Translations
 from pdipc.nonlinear import status
 from pdipc.nonlinear.anderson import Anderson
@@ -69,6 +70,7 @@ def kernels(real: Real) -> SimpleNamespace:
         pairs: wp.array(dtype=wp.int32),
         passes: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
+        script: wp.array(dtype=wp.int32),
         increment: wp.array(dtype=scalar),
         clock: wp.array(dtype=wp.float64),
         tolerance: scalar,
@@ -78,20 +80,18 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
-        """Line 16, at the untruncated motion: the truncated one becomes small because t_I does, converged or not.
+        """Line 16, at the untruncated motion: the truncated one becomes small because t_I does, converged or not. script: its flags.
 
         Iterations converge linearly: with the ratio r of the last two motions the error that is left is about r / (1 - r) of the last.
         """
         code = int(status.RUNNING)
         residual = numbers[status.MOVED]
-        waits = count[status.BEHIND] > 0 and count[status.OUTER] % 2 == 1  # see commit
         # the first motion says nothing of how fast they shrink
         ratio = scalar(0.99)
         if count[status.OUTER] > 0:
             ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
         left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
         numbers[status.MOVED_BEFORE] = residual
-        count[status.BEHIND] = 0
         if overflow[0] != 0:
             code = status.OVERFLOW
         elif residual >= scalar(wp.inf):
@@ -99,15 +99,20 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.OUTER] = count[status.OUTER] + 1
         else:
             count[status.OUTER] = count[status.OUTER] + 1
+            count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
+            if script[ARRIVED] != 0:
+                count[status.SINCE] = 0
             if passes[0] > 0:
                 count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
-            settled = passes[0] == 0 and not waits and left <= tolerance
-            if settled:
+            settled = passes[0] == 0 and left <= tolerance
+            if settled and script[AHEAD] == 0:
                 code = status.CONVERGED
+            elif settled and script[WILL] == 0:
+                code = status.LAGGING
             elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
-            elif count[status.OUTER] >= max_outer:
+            elif count[status.SINCE] >= max_outer:
                 code = status.CAPPED
         count[status.STATUS] = code
         going_out[0] = 0
@@ -117,34 +122,42 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module)
     def commit(
         first: int,
-        count: wp.array(dtype=wp.int32),
-        base: wp.array(dtype=vec3),
+        overflow: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
         u_end: wp.array(dtype=vec3),
         x_end: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
         u_out: wp.array(dtype=vec3),
         x_out: wp.array(dtype=vec3),
+    ):
+        """The truncated motion is made."""
+        i = first + wp.tid()
+        if overflow[0] == 0 and numbers[status.MOVED] < scalar(wp.inf):
+            x_out[i] = x_end[i]
+            u_out[i] = u_end[i]
+
+    @wp.kernel(module=module)
+    def lead(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        target: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        mover: wp.array(dtype=wp.int32),
+        drive: wp.array(dtype=wp.int32),
         u_tilde_out: wp.array(dtype=vec3),
         lag_out: wp.array(dtype=scalar),
     ):
-        """The truncated motion is made. Scripted vertices that it left behind their target go on to it in every second outer
-        iteration: in the one between, the others make way, so that gaps do not shrink from iteration to iteration.
-        """
+        """Where the next outer iteration starts from; what is scripted goes on to its waypoint. lag: m, how far it is from its goal."""
         i = first + wp.tid()
         lag_out[i] = scalar(0.0)
-        if count[status.STATUS] != status.OVERFLOW and count[status.STATUS] != status.NOT_FINITE:
-            x_out[i] = x_end[i]
-            u_out[i] = u_end[i]
-            u_tilde_out[i] = u_end[i]
-            left = (target[i] - base[i]) - u_end[i]
-            if free[i] == scalar(0.0) and wp.length_sq(left) > scalar(0.0):
-                count[status.BEHIND] = 1
-                lag_out[i] = wp.length(left)
-                if count[status.OUTER] % 2 == 0:
-                    u_tilde_out[i] = u_end[i] + left
+        u_tilde_out[i] = u[i]
+        if free[i] == scalar(0.0):
+            lag_out[i] = wp.length((goal[i] - base[i]) - u[i])
+            if drive[wp.max(mover[i], 0)] != 0:
+                u_tilde_out[i] = target[i] - base[i]
 
-    return SimpleNamespace(inertia=inertia, measure=measure, decide=decide, commit=commit)
+    return SimpleNamespace(inertia=inertia, measure=measure, decide=decide, commit=commit, lead=lead)
 
 
 class LocalGlobal:
@@ -244,14 +257,21 @@ class LocalGlobal:
         """Line 16."""
         w, k = self.work, self.kernels
         self.pairs.expect(w.u, w.u_tilde, w.truncation.fraction)
-        self._decide(k.decide, [])
-        t = w.truncation
-        motion = [w.x_start, t.u_end, t.x_end, w.target, self.model.free, w.u, w.x, w.u_tilde, self.lags]
-        self.device.launch(k.commit, self.model.vertex_count, [w.count, *motion])
+        t, n, free = w.truncation, self.model.vertex_count, self.model.free
+        motion = [t.u_end, t.x_end, w.u, w.x]
+        self._measure()
+        self.device.launch(k.commit, n, [w.candidates.overflow, self.numbers, *motion])
+        w.script.advance(w.x_start, w.u, t.fraction)
+        aims = [w.script.target, w.script.goal, w.script.mover, w.script.drive]
+        self.device.launch(k.lead, n, [w.x_start, w.u, free, *aims, w.u_tilde, self.lags])
         self.largest.max(self.lags, self.numbers, status.LAG)
+        self._decide(k.decide, [])
+
+    def _measure(self) -> None:
+        """What is to be known of the motion before it is made: nothing."""
 
     def _decide(self, kernel: wp.Kernel, extra: list) -> None:
         w, s = self.work, self.model.settings
-        states = [self.pairs.count, w.truncation.passes, w.candidates.overflow, self.loop.moved, w.clock]
+        states = [self.pairs.count, w.truncation.passes, w.candidates.overflow, w.script.flags, self.loop.moved, w.clock]
         limits = [self.model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
         self.device.launch_serial(kernel, [*states, *limits, *extra, self.numbers, w.count, w.going])

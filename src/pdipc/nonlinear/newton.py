@@ -17,8 +17,8 @@ fraction that truncation left to one of its vertices, then by halves. What CCD h
 unless a script moves something that the island may touch: then the potential itself has changed.
 
 Newton's own step is the estimate of the error, since it is what one more iteration would change: the step has converged when no free
-vertex would go further than the tolerance, was neither truncated nor turned back, and all that is scripted has arrived. Scripted vertices
-that were truncated go on in later iterations, as long as no pair of theirs is squeezed; else they wait, and the result says how far behind they are.
+vertex would go further than the tolerance, was neither truncated nor turned back, and all that is scripted has arrived. What is
+scripted goes from waypoint to waypoint, an outer iteration each where nothing is in the way (`integration.script`).
 """
 
 import functools
@@ -35,6 +35,7 @@ from pdipc.collision.islands import Islands
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
+from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.nonlinear import status
@@ -44,7 +45,6 @@ FRICTION_LAGS = (
 )
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
-DRIVES = 24  # outer iterations in which scripted vertices go on to their targets, at most
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
@@ -64,7 +64,7 @@ PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
     module = real.module(__name__)
     wide = wp.float64
     slack = wp.constant(wp.float64(SLACK[real.name]))
@@ -113,6 +113,7 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
+        mover: wp.array(dtype=wp.int32),
         drive: wp.array(dtype=wp.int32),
         barrier: wp.array(dtype=vec3),
         friction: wp.array(dtype=vec3),
@@ -126,7 +127,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += friction[i]
         rhs[i] = free[i] * total
         p_out[i] = vec3()
-        if free[i] == scalar(0.0) and drive[0] != 0:
+        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
             p_out[i] = (target[i] - base[i]) - u[i]
 
     @wp.func
@@ -210,6 +211,9 @@ def kernels(real: Real) -> SimpleNamespace:
         body: wp.array(dtype=wp.int32),
         center: wp.array(dtype=wp.vec3d),
         turn: wp.array(dtype=wp.vec3d),
+        target: wp.array(dtype=vec3),
+        mover: wp.array(dtype=wp.int32),
+        drive: wp.array(dtype=wp.int32),
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
         moved_out: wp.array(dtype=scalar),
@@ -226,8 +230,11 @@ def kernels(real: Real) -> SimpleNamespace:
         b = body[i]
         if b >= 0 and moved < scalar(wp.inf):
             step += curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)])
-        u_tilde_out[i] = u[i] + step
-        x_tilde_out[i] = base[i] + (u[i] + step)
+        u_tilde = u[i] + step
+        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
+            u_tilde = target[i] - base[i]  # to the bit, so that it is known to have arrived
+        u_tilde_out[i] = u_tilde
+        x_tilde_out[i] = base[i] + u_tilde
         moved_out[i] = moved
         if free[i] == scalar(0.0) and moved < scalar(wp.inf):
             moved_out[i] = scalar(0.0)
@@ -357,7 +364,7 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         base: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
         u_end: wp.array(dtype=vec3),
         x_end: wp.array(dtype=vec3),
@@ -365,14 +372,14 @@ def kernels(real: Real) -> SimpleNamespace:
         x_out: wp.array(dtype=vec3),
         lag_out: wp.array(dtype=scalar),
     ):
-        """The motion is made. lag: how far a scripted vertex is from its target, m."""
+        """The motion is made. lag: how far a scripted vertex is from its goal, m."""
         i = first + wp.tid()
         lag_out[i] = scalar(0.0)
         if overflow[0] == 0:
             u_out[i] = u_end[i]
             x_out[i] = x_end[i]
             if free[i] == scalar(0.0):
-                lag_out[i] = wp.length((target[i] - base[i]) - u_end[i])
+                lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
 
     @wp.kernel(module=module)
     def commit_energies(
@@ -391,22 +398,30 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         gaps: wp.array(dtype=scalar),
         activation: wp.array(dtype=scalar),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         base: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
+        mover: wp.array(dtype=wp.int32),
         crowded_out: wp.array(dtype=wp.int32),
     ):
-        """Whether a pair of a scripted vertex that is behind its target is squeezed."""
+        """Which movers have a pair that is squeezed, and that what is left of their way would close; whoever writes, writes the same."""
         k = first + wp.tid()
         if k < pairs[0] and gaps[k] < scalar(SQUEEZED) * activation[k]:
+            closing = scalar(0.0)
             for s in range(4):
                 i = quads[k][s]
-                if free[i] == scalar(0.0) and wp.length((target[i] - base[i]) - u[i]) > scalar(0.0):
-                    crowded_out[0] = 1
+                if free[i] == scalar(0.0):
+                    closing += weights[k][s] * wp.dot(normals[k], (target[i] - base[i]) - u[i])
+            for s in range(4):
+                i = quads[k][s]
+                if free[i] == scalar(0.0) and closing < scalar(0.0):
+                    crowded_out[mover[i]] = 1
 
     @wp.kernel(module=module)
-    def clear_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
-        flag_out[0] = 0
+    def clear(first: int, flags_out: wp.array(dtype=wp.int32)):
+        flags_out[first + wp.tid()] = 0
 
     @wp.kernel(module=module)
     def set_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
@@ -443,12 +458,7 @@ def kernels(real: Real) -> SimpleNamespace:
             p[i] = vec3()
 
     @wp.kernel(module=module)
-    def start(
-        first: int,
-        drive_out: wp.array(dtype=wp.int32),
-        lagging_out: wp.array(dtype=wp.int32),
-    ):
-        drive_out[0] = 1
+    def start(first: int, lagging_out: wp.array(dtype=wp.int32)):
         lagging_out[0] = FRICTION_LAGS
 
     @wp.kernel(module=module)
@@ -467,7 +477,7 @@ def kernels(real: Real) -> SimpleNamespace:
         pairs: wp.array(dtype=wp.int32),
         hits: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
-        crowded: wp.array(dtype=wp.int32),
+        script: wp.array(dtype=wp.int32),
         projected: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
@@ -475,16 +485,17 @@ def kernels(real: Real) -> SimpleNamespace:
         max_outer: int,
         budget_ms: wide,
         numbers: wp.array(dtype=scalar),
-        drive: wp.array(dtype=wp.int32),
         lagging: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
-        """Line 16. numbers: the largest wanted motion and lag, m."""
+        """Line 16. script: its flags. numbers: the largest wanted motion and lag, m.
+
+        Whatever is limited begins anew where something scripted came to a waypoint: what follows is another problem.
+        """
         code = int(status.RUNNING)
         residual = numbers[status.MOVED]
         behind = numbers[status.LAG] > scalar(0.0)
-        driven = drive[0] != 0
         # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes.
         # One motion alone says nothing: the first step out of a stiff barrier is short, however far the way is that it opens
         ratio = scalar(0.99)
@@ -496,35 +507,34 @@ def kernels(real: Real) -> SimpleNamespace:
             code = status.OVERFLOW
         else:
             count[status.OUTER] = count[status.OUTER] + 1
+            count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
             lagging[0] = lagging[0] - 1
+            if script[ARRIVED] != 0:
+                count[status.SINCE] = 0
+                count[status.STALLED] = 0
+                lagging[0] = FRICTION_LAGS
             if hits[0] > 0:
                 count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
             if attempts[0] > 1:
                 count[status.SEARCHES] = count[status.SEARCHES] + 1
             if attempts[0] > HALVINGS:
                 count[status.STALLED] = count[status.STALLED] + 1
-            if driven:
-                count[status.DRIVEN] = count[status.DRIVEN] + 1
             if projected[0] != 0:
                 left = left / scalar(EXACT)
             settled = left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
-            elif settled and not behind:
+            elif settled and not behind and script[AHEAD] == 0:
                 code = status.CONVERGED
-            elif settled and (crowded[0] != 0 or count[status.DRIVEN] >= DRIVES) and not driven:
+            elif settled and script[WILL] == 0:
                 code = status.LAGGING
             elif count[status.STALLED] >= STALLS:
                 code = status.STALLING
             elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
-            elif count[status.OUTER] >= max_outer:
+            elif count[status.SINCE] >= max_outer:
                 code = status.CAPPED
-        # scripted vertices go on in every second iteration: in the one between, the others make way
-        drive[0] = 0
-        if behind and not driven and crowded[0] == 0 and count[status.DRIVEN] < DRIVES:
-            drive[0] = 1
         count[status.STATUS] = code
         going_out[0] = 0
         if code == status.RUNNING:
@@ -619,13 +629,11 @@ class Newton:
             self.attempts,
             self.searching,
             self.hits,
-            self.drive,
             self.lagging,
-            self.crowded,
-            self.still,
             self.project,
             self.renew,
-        ) = (zeros(wp.int32, 1) for _ in range(9))
+        ) = (zeros(wp.int32, 1) for _ in range(6))
+        self.nobody = zeros(wp.int32, len(work.script.movers))
         self.pairs.project = self.project
         self.largest = Reducer(device, real, n)
         lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
@@ -664,7 +672,7 @@ class Newton:
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        self.device.launch_serial(self.kernels.start, [self.drive, self.lagging])
+        self.device.launch_serial(self.kernels.start, [self.lagging])
         self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
@@ -715,7 +723,7 @@ class Newton:
         w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
         model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
         friction = None if self.friction is None else self.friction.force_of_vertex
-        where = [w.u, w.x_start, w.target, model.free, self.drive]
+        where = [w.u, w.x_start, w.script.target, model.free, w.script.mover, w.script.drive]
         device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
         device.when(self.renew, self._assemble)
         self._solve_linear()
@@ -724,6 +732,7 @@ class Newton:
             inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p, self.center, self.turn]
             device.launch(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial, self.islands.body, self.center, self.turn]
+        inputs += [w.script.target, w.script.mover, w.script.drive]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
         self.largest.max(self.moved, self.numbers, status.MOVED)
         self.largest.max(self.forces, self.numbers, status.FORCE)
@@ -756,11 +765,22 @@ class Newton:
         self.device.launch(
             self.kernels.begin,
             n,
-            [w.u, w.x_start, w.target, model.free, self.still, self.pairs.force_of_vertex, None, r.zero, self.p],
+            [
+                w.u,
+                w.x_start,
+                w.script.target,
+                model.free,
+                w.script.mover,
+                self.nobody,
+                self.pairs.force_of_vertex,
+                None,
+                r.zero,
+                self.p,
+            ],
         )
         couplings = [each for each in self._couplings() if each is not self.friction]
         self.solver.prepare(w.x, couplings)
-        self.solver.solve(self.p, r.zero, couplings, 0.0, self.still, REBOUND_TOLERANCE[model.real.name])
+        self.solver.solve(self.p, r.zero, couplings, 0.0, self.nobody, REBOUND_TOLERANCE[model.real.name])
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
 
@@ -777,7 +797,7 @@ class Newton:
         device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts])
         self.islands.find(w.candidates)
         device.launch_serial(k.clear_motion, [w.count])
-        if model.moves:
+        if w.script.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
         self._evaluate(t.u_end, t.x_end)
@@ -808,19 +828,21 @@ class Newton:
             device.launch_serial(k.judge, judging)
 
         device.loop(self.searching, search)
-        inputs = [w.count, w.candidates.overflow, w.x_start, w.target, model.free, t.u_end, t.x_end]
+        inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
         self.largest.max(self.lags, self.numbers, status.LAG)
         self._keep_energies()
-        device.launch_serial(k.clear_flag, [self.crowded])
-        if model.moves:
+        if w.script.moves:
             p = self.pairs
-            inputs = [p.count, p.quads, model.free, p.gaps, p.activation, w.u, w.x_start, w.target]
-            device.launch(k.crowd, p.capacity, [*inputs, self.crowded])
+            device.launch(k.clear, len(w.script.movers), [w.script.crowded])
+            inputs = [p.count, p.quads, model.free, p.gaps, p.activation, p.weights, p.normals]
+            inputs += [w.u, w.x_start, w.script.target, w.script.mover, w.script.crowded]
+            device.launch(k.crowd, p.capacity, inputs)
+        w.script.advance(w.x_start, w.u, t.fraction)
         s = model.settings
-        states = [self.pairs.count, self.hits, self.attempts, self.crowded, self.project, w.candidates.overflow, w.clock]
+        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, w.candidates.overflow, w.clock]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
-        device.launch_serial(k.decide, [*states, *limits, self.numbers, self.drive, self.lagging, w.count, w.going])
+        device.launch_serial(k.decide, [*states, *limits, self.numbers, self.lagging, w.count, w.going])
 
 
 @functools.cache

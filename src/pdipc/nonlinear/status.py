@@ -8,8 +8,9 @@ STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places
 RUNNING, CONVERGED, LAGGING, CAPPED, OUT_OF_TIME, STALLING, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(8))
 
 # `count`, int32: of a step
-STATUS, OUTER, TRUNCATIONS, BARRIERS, BEHIND, SEARCHES, STALLED, DRIVEN, MOVING = (wp.constant(place) for place in range(9))
-COUNTS = 9
+# OUTER: outer iterations; SINCE: those since something scripted came to a waypoint
+STATUS, OUTER, TRUNCATIONS, BARRIERS, SEARCHES, STALLED, MOVING, SINCE = (wp.constant(place) for place in range(8))
+COUNTS = 8
 
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
 # the largest force of inertia, to compare it with; how far something scripted is behind, m

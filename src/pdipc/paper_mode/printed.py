@@ -7,6 +7,7 @@ import warp as wp
 
 from pdipc.barrier.pairs import Exerted
 from pdipc.device.precision import Real
+from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.nonlinear import status
 from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.paper_mode.energy_rate import EnergyRate
@@ -32,6 +33,7 @@ def kernels(real: Real):
         pairs: wp.array(dtype=wp.int32),
         passes: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
+        script: wp.array(dtype=wp.int32),
         increment: wp.array(dtype=scalar),
         clock: wp.array(dtype=wp.float64),
         tolerance: scalar,
@@ -45,8 +47,6 @@ def kernels(real: Real):
         """Line 16 as printed: it looks at the truncated motion, which becomes small because t_I does, converged or not."""
         code = int(status.RUNNING)
         residual = numbers[status.MOVED]
-        waits = count[status.BEHIND] > 0 and count[status.OUTER] % 2 == 1
-        count[status.BEHIND] = 0
         if overflow[0] != 0:
             code = status.OVERFLOW
         elif residual >= scalar(wp.inf):
@@ -54,15 +54,21 @@ def kernels(real: Real):
             count[status.OUTER] = count[status.OUTER] + 1
         else:
             count[status.OUTER] = count[status.OUTER] + 1
+            count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
+            if script[ARRIVED] != 0:
+                count[status.SINCE] = 0
             if passes[0] > 0:
                 count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
             numbers[status.MOVED] = wp.sqrt(committed[0])
-            if numbers[status.MOVED] <= wp.sqrt(scalar(OUTER_SQUARED)) and not waits:
+            small = numbers[status.MOVED] <= wp.sqrt(scalar(OUTER_SQUARED))
+            if small and script[AHEAD] == 0:
                 code = status.CONVERGED
+            elif small and script[WILL] == 0:
+                code = status.LAGGING
             elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
-            elif count[status.OUTER] >= max_outer:
+            elif count[status.SINCE] >= max_outer:
                 code = status.CAPPED
         count[status.STATUS] = code
         going_out[0] = 0
@@ -109,8 +115,10 @@ class Printed(LocalGlobal):
         forces = reactions(missing, quads, parts, model.assembly.body_of_vertex, model.free_vertices)
         return Exerted(quads, forces), Exerted(quads[:0], forces[:0])
 
-    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
+    def _measure(self) -> None:
         w = self.work
         self.device.launch(self.own.measure_squared, self.model.vertex_count, [w.u, w.truncation.u_end, self.moved])
         self.largest.sum(self.moved, self.committed)
+
+    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
         super()._decide(self.own.decide, [self.committed])

@@ -48,7 +48,8 @@ class AssembledBody:
 
     tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward.
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
-    trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds.
+    trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. origin (3,) m and orientation (3, 3): where its
+    mesh's origin and axes are at the start.
     """
 
     name: str
@@ -62,6 +63,8 @@ class AssembledBody:
     friction: float
     trajectory: Trajectory | Deforming | None = None
     inside: Inside | None = None
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    orientation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     @property
     def kinematic(self) -> bool:
@@ -385,6 +388,8 @@ def gather(
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
                 trajectory=deforming,
                 inside=placed.inside if isinstance(placed, Cloth) else None,
+                origin=np.array(placed.translation) + offset,
+                orientation=rotation_matrix(placed.rotation),
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):

@@ -16,6 +16,8 @@ from pdipc.scene.check_garments import check_garments
 from pdipc.scene.errors import SceneError
 from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
+from pdipc.scene.motion import Trajectory
+from pdipc.scene.movers import MOST, most_chords, movers_of
 from pdipc.scene.schema import Cloth, Scene, local_global_settings, uses_newton
 
 LISTED = 5  # vertices that a finding names
@@ -61,7 +63,16 @@ def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[
     precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
     complete = not (problems or part.problems)
     fit_defaults(scene, assembly, precision)
-    return findings + _check(assembly, precision, complete), assembly.notes
+    return [*findings, *_turns(scene, assembly), *_check(assembly, precision, complete)], assembly.notes
+
+
+def check_placed(assembly: Assembly, positions: np.ndarray, precision: str, body: int) -> list[Finding]:
+    """What keeps a body, by its number, from being where positions (n, 3) m, of all, have it: as at the start of a scene."""
+    assembly = replace(assembly, positions=positions)
+    label = _label(assembly.bodies[body])
+    touching, found = _intersections(assembly, precision)
+    found = [*found, *_too_close(assembly, touching, precision), *_inside(assembly, touching)]
+    return [finding for finding in found if label in finding.where.split(" and ") or label in finding.found]
 
 
 def _unreadable(problem: str) -> Finding:
@@ -72,7 +83,7 @@ def _unreadable(problem: str) -> Finding:
 def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
     """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`, whose defaults are fitted first."""
     fit_defaults(scene, assembly, precision)
-    findings = [*_settings(scene), *check(assembly, precision)]
+    findings = [*_settings(scene), *_turns(scene, assembly), *check(assembly, precision)]
     if findings:
         found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
         raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
@@ -309,6 +320,22 @@ def _motions(assembly: Assembly) -> Iterator[Finding]:
             yield Finding(
                 label, found, "poses are relative to the start: place it there and let the first keyframe not move it"
             )
+
+
+def _turns(scene: Scene, assembly: Assembly) -> Iterator[Finding]:
+    """What turns so fast that its arcs cannot be followed."""
+    h = scene.simulation.time_step / scene.simulation.substeps
+    for mover in movers_of(assembly):
+        chords = most_chords(mover, h)
+        if not chords <= MOST:
+            assert isinstance(mover.trajectory, Trajectory)
+            angle = h * mover.trajectory.fastest()
+            found = (
+                f"turns by up to {angle:.3g} rad in a step of {h:g} s; that no straight piece is further than {mover.deviation:.3g} m from the "
+                f"arc takes {chords:.4g} of them"
+            )
+            right = f"they must be at most {MOST}: take a shorter time_step or more substeps"
+            yield Finding(mover.label, found, right + (", or a larger minimum separation" if mover.body >= 0 else ""))
 
 
 def _activation(assembly: Assembly, precision: str) -> Iterator[Finding]:

@@ -1,0 +1,474 @@
+"""What follows a script or a command: the way of a step, from waypoint to waypoint, and how far it has come.
+
+Vertices move in straight lines from one outer iteration to the next, and CCD proves these. What turns moves on arcs, so it is led
+from waypoint to waypoint, poses on its way that are so near that no chord is further than `deviation` from the arc (`scene.motion`).
+
+**Lemma (arcs).** Let s be the deviation of an obstacle's chords, and e how far its vertices are from its pose at the fraction of the way that
+it has come. In a motion by a part f of what is left to the next waypoint e becomes at most (1 - f) e + 4 f (1 - f) s: the first is what a
+straight line leaves of e, the second how far a parabola of sagitta s is from its own chord at f. If e <= 4 s that is at most 4 s (1 -
+f^2), so e <= 4 s for ever, wherever the obstacle was stopped. With s = CHORD xi, CHORD = 0.2, and CCD keeping the separation xi to the chords, the
+true arcs keep a fifth of xi: nothing is passed by what turns, however fast. Rounding: an obstacle's vertices share one fraction, and a
+minimum separation is a hundred roundings at least.
+
+Vertices of a pin turn about each other, not past an obstacle's arcs: they are on their own, and their chords may deviate by the
+activation distance.
+
+Who waits: a mover that was stopped goes on in every second outer iteration, so that the others make way in between, as long as no pair of it
+is squeezed and for at most TRIES times from one waypoint to the next; then it is late. It follows its script from where it was
+stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again.
+"""
+
+import functools
+import itertools
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
+from pdipc.scene.assembly import Assembly
+from pdipc.scene.motion import Approach, Deforming, Trajectory
+from pdipc.scene.movers import MOST, Mover, movers_of
+
+CATCH_UP = 2.0  # times the script's pace
+TRIES = 24  # outer iterations in which a mover goes on to one waypoint
+AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3 = real.scalar, real.vec3
+    module = real.module(__name__)
+    zero = wp.constant(scalar(0.0))
+
+    @wp.kernel(module=module)
+    def begin(
+        first: int,
+        at_out: wp.array(dtype=wp.int32),
+        left_out: wp.array(dtype=scalar),
+        tries_out: wp.array(dtype=wp.int32),
+        drive_out: wp.array(dtype=wp.int32),
+        crowded_out: wp.array(dtype=wp.int32),
+    ):
+        m = first + wp.tid()
+        at_out[m] = 1
+        left_out[m] = scalar(1.0)
+        tries_out[m] = 1
+        drive_out[m] = 1
+        crowded_out[m] = 0
+
+    @wp.kernel(module=module)
+    def aim(
+        first: int,
+        members: wp.array(dtype=wp.int32),
+        mover: wp.array(dtype=wp.int32),
+        points: wp.array(dtype=wp.vec3d),
+        at: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        offset: wp.array(dtype=wp.int32),
+        straight: wp.array(dtype=wp.int32),
+        center: wp.array(dtype=wp.vec3d),
+        turns: wp.array(dtype=wp.mat33d),
+        places: wp.array(dtype=wp.vec3d),
+        parts: wp.array(dtype=wp.float64),
+        x_start: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        target_out: wp.array(dtype=vec3),
+    ):
+        """The waypoint that each member goes to now."""
+        k = first + wp.tid()
+        i = members[k]
+        m = mover[i]
+        slot = offset[m] + at[m] - 1
+        target_out[i] = goal[i]
+        if at[m] < count[m]:
+            if straight[m] != 0:
+                target_out[i] = x_start[i] + scalar(parts[slot]) * (goal[i] - x_start[i])
+            else:
+                x = turns[slot] * (points[k] - center[m]) + places[slot]
+                target_out[i] = vec3(scalar(x[0]), scalar(x[1]), scalar(x[2]))
+
+    @wp.kernel(module=module)
+    def clear(first: int, behind_out: wp.array(dtype=wp.int32)):
+        behind_out[first + wp.tid()] = 0
+
+    @wp.kernel(module=module)
+    def compare(
+        first: int,
+        members: wp.array(dtype=wp.int32),
+        mover: wp.array(dtype=wp.int32),
+        base: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        behind_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a mover has not reached its waypoint; whoever writes, writes the same."""
+        i = members[first + wp.tid()]
+        if wp.length_sq((target[i] - base[i]) - u[i]) > zero:
+            behind_out[mover[i]] = 1
+
+    @wp.kernel(module=module)
+    def advance(
+        first: int,
+        movers: int,
+        leaders: wp.array(dtype=wp.int32),
+        fraction: wp.array(dtype=scalar),
+        count: wp.array(dtype=wp.int32),
+        behind: wp.array(dtype=wp.int32),
+        crowded: wp.array(dtype=wp.int32),
+        at: wp.array(dtype=wp.int32),
+        left: wp.array(dtype=scalar),
+        tries: wp.array(dtype=wp.int32),
+        drive: wp.array(dtype=wp.int32),
+        flags_out: wp.array(dtype=wp.int32),
+        chords_out: wp.array(dtype=wp.int32),
+    ):
+        """Who goes on in the next outer iteration, and where to."""
+        for k in range(3):
+            flags_out[k] = 0
+        for m in range(movers):
+            goes = int(0)
+            under_way = int(1)
+            if behind[m] == 0:
+                left[m] = zero
+                under_way = 0
+                if at[m] < count[m]:
+                    at[m] = at[m] + 1
+                    left[m] = scalar(1.0)
+                    tries[m] = 0
+                    under_way = 1
+                    flags_out[ARRIVED] = 1
+                    if crowded[m] == 0:
+                        goes = 1
+            elif drive[m] != 0:
+                left[m] = left[m] * (scalar(1.0) - fraction[leaders[m]])
+            elif crowded[m] == 0 and tries[m] < TRIES:
+                goes = 1
+            if under_way != 0:
+                flags_out[AHEAD] = 1
+                if goes != 0 or (crowded[m] == 0 and tries[m] < TRIES):
+                    flags_out[WILL] = 1
+            drive[m] = goes
+            tries[m] = tries[m] + goes
+            chords_out[0] = wp.max(chords_out[0], at[m])
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+
+
+@dataclass
+class Way:
+    """The way of a mover in a step. times: (k,), of its waypoints, ascending in the path's own time; start: where in it the step starts."""
+
+    path: Trajectory | Deforming | Approach | None
+    start: float
+    times: np.ndarray
+
+
+@dataclass
+class Lead:
+    """A command in place of a script. speed: m/s, of its fastest vertex at most.
+
+    points: (k, 3) m, where its vertices are to go; or pose, the turn of an obstacle from its start and the place of its origin, (3,) m.
+    """
+
+    speed: float
+    points: np.ndarray | None = None
+    pose: tuple[Rotation, np.ndarray] | None = None
+
+
+@dataclass
+class Reached:
+    """How far movers that are rigid have come; what is late goes on from here.
+
+    times: (bodies,) s, in its script; of bodies, and of what follows none, the time of the state. poses: (bodies, 7), the turn from the start as a
+    quaternion x, y, z, w and the place of the origin, m, of what is led by a command; else 0. anchors: (k, 3) m, the points that the springs of
+    pins end at, pin by pin.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    anchors: np.ndarray
+
+    @classmethod
+    def at(cls, time: float, assembly: Assembly) -> "Reached":
+        """Everybody in time."""
+        bodies = len(assembly.bodies)
+        anchors = [assembly.pin_targets(assembly.pins[pin], time) for pin in soft_pins(assembly)]
+        return cls(np.full(bodies, time), np.zeros((bodies, 7)), np.concatenate([np.zeros((0, 3)), *anchors]))
+
+    def copy(self) -> "Reached":
+        """An independent copy."""
+        return Reached(self.times.copy(), self.poses.copy(), self.anchors.copy())
+
+    def pose(self, mover: Mover) -> tuple[Rotation, np.ndarray]:
+        """Turn from the start, and place of the origin, (3,) m."""
+        row = self.poses[mover.body]
+        if row.any():
+            return Rotation.from_quat(row[:4]), row[4:].copy()
+        path = mover.trajectory
+        assert isinstance(path, Trajectory)
+        rotation, p = path.pose(self.times[mover.body])
+        return Rotation.from_matrix(rotation), rotation @ (mover.origin - path.center) + path.center + p
+
+
+def soft_pins(assembly: Assembly) -> list[int]:
+    """The pins that hold by springs, in the order of `Projector.anchors`."""
+    return [number for number, pin in enumerate(assembly.pins) if pin.stiffness is not None and len(pin.vertices)]
+
+
+class Script:
+    """The movers of a simulation, and what leads them.
+
+    leads: commands, by the number of the mover; beyond these, of the pins that hold by springs. anchors: (k, 3) m, where those end.
+
+    target: (n,) vec3, m, where each scripted vertex goes in this outer iteration; goal: in this step. mover: (n,) int32, -1 for none.
+    drive, crowded: (movers,) int32, who goes on in this outer iteration, and who has a pair that is squeezed. flags: (3,) int32, whether
+    anybody is not at its goal, has come to a waypoint in this outer iteration, or is to go on in a later one. chords: (1,) int32.
+    moves: whether anything leaves its place. generation: grows when that changes.
+    """
+
+    def __init__(self, assembly: Assembly, device: Device, real: Real, h: float):
+        self.assembly, self.device, self.real, self.h, self.kernels = assembly, device, real, h, kernels(real)
+        self.movers, self.generation = movers_of(assembly), 0
+        self.leads: dict[int, Lead] = {}
+        self.soft = soft_pins(assembly)
+        self.anchors: np.ndarray | None = None
+        self._ways: list[Way] = []
+        self._late = ""
+        n, count = len(assembly.positions), max(1, len(self.movers))
+
+        def zeros(dtype, size=count) -> wp.array:
+            return wp.zeros(size, dtype=dtype, device=device.warp)
+
+        def upload(values, dtype) -> wp.array:
+            return wp.array(values, dtype=dtype, device=device.warp)
+
+        self.goal, self.target = zeros(real.vec3, n), zeros(real.vec3, n)
+        self.at, self.tries, self.drive, self.crowded, self.behind = (zeros(wp.int32) for _ in range(5))
+        self.left, self.flags, self.chords = zeros(real.scalar), zeros(wp.int32, 3), zeros(wp.int32, 1)
+        self.count, self.offset, self.straight, self.center = (
+            zeros(wp.int32),
+            zeros(wp.int32),
+            zeros(wp.int32),
+            zeros(wp.vec3d),
+        )
+        owner = np.full(n, -1, dtype=np.int32)
+        for number, mover in enumerate(self.movers):
+            owner[mover.vertices] = number
+        members = np.concatenate([np.zeros(0, dtype=np.int32), *(mover.vertices for mover in self.movers)]).astype(np.int32)
+        points = np.concatenate([np.zeros((0, 3)), *(mover.points for mover in self.movers)])
+        self.member_count = len(members)
+        self.mover, self.members = upload(owner, wp.int32), upload(np.append(members, 0).astype(np.int32), wp.int32)
+        self.points = upload(np.append(points, np.zeros((1, 3)), axis=0), wp.vec3d)
+        self.leaders = upload(np.array([mover.vertices[0] for mover in self.movers] or [0], dtype=np.int32), wp.int32)
+        self._where = assembly.positions.copy()  # the goal on the host
+        self._uploaded = False
+        self._room(16)
+
+    def _room(self, size: int) -> None:
+        self.turns, self.places, self.parts = (
+            wp.zeros(size, dtype=dtype, device=self.device.warp) for dtype in (wp.mat33d, wp.vec3d, wp.float64)
+        )
+        self.generation += 1
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything leaves its place."""
+        return any(number < len(self.movers) for number in self.leads) or any(not mover.still for mover in self.movers)
+
+    def number_of_pin(self, pin: int) -> int:
+        """Where its command is in `leads`. pin: its place in the assembly."""
+        if pin in self.soft:
+            return len(self.movers) + self.soft.index(pin)
+        return next(number for number, mover in enumerate(self.movers) if mover.pin == pin)
+
+    def commands(self) -> dict[str, np.ndarray]:
+        """The commands as arrays by name; see `leads_of`."""
+        arrays = {
+            "lead_numbers": np.array(list(self.leads), dtype=np.int64),
+            "lead_speeds": np.array([lead.speed for lead in self.leads.values()], dtype=np.float64),
+        }
+        for number, lead in self.leads.items():
+            if lead.points is not None:
+                arrays[f"lead_{number}_points"] = lead.points
+            elif lead.pose is not None:
+                arrays[f"lead_{number}_pose"] = np.concatenate([lead.pose[0].as_quat(), lead.pose[1]])
+        return arrays
+
+    def leads_of(self, arrays: dict[str, np.ndarray]) -> dict[int, Lead]:
+        """The commands that `commands` gave."""
+        leads = {}
+        for number, speed in zip(arrays["lead_numbers"].tolist(), arrays["lead_speeds"].tolist(), strict=True):
+            pose, points = arrays.get(f"lead_{number}_pose"), arrays.get(f"lead_{number}_points")
+            leads[number] = Lead(speed, points, None if pose is None else (Rotation.from_quat(pose[:4]), np.array(pose[4:])))
+        return leads
+
+    def rigid(self) -> list[np.ndarray]:
+        """The vertices of each obstacle that moves without deforming."""
+        found = []
+        for number, mover in enumerate(self.movers):
+            lead = self.leads.get(number)
+            if mover.rigid and (not mover.still if lead is None else lead.pose is not None):
+                found.append(mover.vertices)
+        return found
+
+    # Before and after a step.
+
+    def plan(self, time: float, reached: Reached, positions: wp.array) -> None:
+        """The ways of a step that starts at `time`, s, from positions (n,) vec3."""
+        end = time + self.h
+        self._plan_anchors(end, reached)
+        if self._uploaded and not self.moves:
+            return
+        self._ways = []
+        shared = []  # movers whose scripts are in time go in step with each other
+        for number, mover in enumerate(self.movers):
+            lead, path = self.leads.get(number), mover.trajectory
+            if lead is not None:
+                way = self._led(mover, lead, reached, positions)
+            elif mover.rigid and reached.times[mover.body] < time:
+                start = float(reached.times[mover.body])
+                last = min(end, start + CATCH_UP * self.h)
+                way = Way(path, start, _waypoints([(mover, path)], start, last))
+            else:
+                way = Way(path, time, np.array([end]))
+                shared += [] if mover.still else [number]
+            self._ways.append(way)
+        if shared:
+            turning = [(m, m.trajectory) for m in map(self.movers.__getitem__, shared) if isinstance(m.trajectory, Trajectory)]
+            times = _waypoints(turning, time, end)
+            for number in shared:
+                self._ways[number].times = times
+        self._upload()
+
+    def _plan_anchors(self, end: float, reached: Reached) -> None:
+        if not self.soft:
+            return
+        pins = [self.assembly.pins[pin] for pin in self.soft]
+        ends = np.cumsum([0, *(len(pin.vertices) for pin in pins)])
+        self.anchors = np.empty((ends[-1], 3))
+        for k, pin in enumerate(pins):
+            own, lead = slice(ends[k], ends[k + 1]), self.leads.get(len(self.movers) + k)
+            if lead is None or lead.points is None:
+                self.anchors[own] = self.assembly.pin_targets(pin, end)
+            else:
+                self.anchors[own] = _towards(reached.anchors[own], lead.points, lead.speed * self.h)
+
+    def _led(self, mover: Mover, lead: Lead, reached: Reached, positions: wp.array) -> Way:
+        """A command's way, as far as its speed takes it in a step."""
+        within = lead.speed * self.h
+        if lead.pose is not None:
+            begin = reached.pose(mover)
+            path = Approach(mover.origin, begin, lead.pose)
+            length = float(np.linalg.norm(lead.pose[1] - begin[1])) + mover.reach(path) * path.turning(0.0, 1.0)
+            times = _waypoints([(mover, path)], 0.0, 1.0 if length <= within else within / length)
+            return Way(path, 0.0, times[:MOST])
+        assert lead.points is not None
+        now = positions.numpy()[mover.vertices].astype(np.float64)
+        self._where[mover.vertices] = _towards(now, lead.points, within)
+        return Way(None, 0.0, np.ones(1))
+
+    def _upload(self) -> None:
+        counts = [len(way.times) for way in self._ways]
+        offsets = np.cumsum([0, *counts])
+        if offsets[-1] > len(self.parts):
+            self._room(2 * int(offsets[-1]))
+        turns, places, parts = np.zeros((offsets[-1], 3, 3)), np.zeros((offsets[-1], 3)), np.zeros(offsets[-1])
+        centers, straight = np.zeros((len(counts), 3)), np.ones(len(counts), dtype=np.int32)
+        for number, (mover, way) in enumerate(zip(self.movers, self._ways, strict=True)):
+            own = slice(offsets[number], offsets[number] + counts[number])
+            if way.path is None:
+                continue
+            self._where[mover.vertices] = way.path.apply(mover.points, way.times[-1])
+            parts[own] = (way.times - way.start) / max(way.times[-1] - way.start, 1e-300)
+            if way.path.is_rigid and counts[number] > 1:
+                straight[number], centers[number] = 0, way.path.center
+                poses = [way.path.pose(time) for time in way.times]
+                turns[own], places[own] = [pose[0] for pose in poses], [way.path.center + pose[1] for pose in poses]
+        self.goal.assign(self._where.astype(self.real.numpy))
+        if counts:
+            for array, values in ((self.count, counts), (self.offset, offsets[:-1]), (self.straight, straight)):
+                array.assign(np.asarray(values, dtype=np.int32))
+            self.center.assign(centers)
+        if offsets[-1] > len(counts):  # else each goes to its goal at once
+            for array, values in ((self.turns, turns), (self.places, places), (self.parts, parts)):
+                array[: offsets[-1]].assign(values)
+        self._uploaded = True
+
+    def settle(self, time: float, reached: Reached, lag: float, positions: wp.array) -> tuple[Reached, float, str]:
+        """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and
+        why.
+
+        reached: where the step started. lag: m, how far the last is behind the goal of the step.
+        """
+        now, why = reached.copy(), "where something is in its way"
+        now.times[:] = time
+        if self.anchors is not None:
+            now.anchors = self.anchors.copy()
+        if not self.moves:
+            return now, lag, why
+        arrived = lag == 0.0
+        at, left = (None, None) if arrived else (self.at.numpy(), self.left.numpy())
+        for number, (mover, way) in enumerate(zip(self.movers, self._ways, strict=True)):
+            if way.path is None or not way.path.is_rigid or mover.body < 0:
+                continue
+            come = float(way.times[-1])
+            if at is not None and left is not None:
+                ends = np.concatenate([[way.start], way.times])
+                come = float(ends[at[number]] - float(left[number]) * (ends[at[number]] - ends[at[number] - 1]))
+            if isinstance(way.path, Approach):
+                rotation, p = way.path.pose(come)
+                now.poses[mover.body] = *Rotation.from_matrix(rotation).as_quat(), *(p + way.path.center)
+            elif not mover.still:
+                now.times[mover.body] = come
+                if way.times[-1] < time:
+                    away = mover.trajectory.apply(mover.points, time) - positions.numpy()[mover.vertices]
+                    lag = max(lag, float(np.linalg.norm(away, axis=1).max(initial=0.0)))
+                    why = f"and makes it up at {CATCH_UP:g} times its pace"
+        return now, lag, why
+
+    # Within a step, in launches only.
+
+    def begin(self, x_start: wp.array) -> None:
+        """Everybody goes to the first waypoint."""
+        movers = len(self.movers)
+        if movers:
+            self.device.launch_serial(self.kernels.clear, [self.chords])
+            self.device.launch(self.kernels.begin, movers, [self.at, self.left, self.tries, self.drive, self.crowded])
+            self._aim(x_start)
+
+    def _aim(self, x_start: wp.array) -> None:
+        table = [self.count, self.offset, self.straight, self.center, self.turns, self.places, self.parts]
+        inputs = [self.members, self.mover, self.points, self.at, *table, x_start, self.goal, self.target]
+        self.device.launch(self.kernels.aim, self.member_count, inputs)
+
+    def advance(self, x_start: wp.array, u: wp.array, fraction: wp.array) -> None:
+        """After a motion to x_start + u was made, of which each vertex kept `fraction`: who goes on, and where to."""
+        if not self.movers:
+            return
+        k, device = self.kernels, self.device
+        device.launch(k.clear, len(self.movers), [self.behind])
+        device.launch(k.compare, self.member_count, [self.members, self.mover, x_start, self.target, u, self.behind])
+        states = [self.behind, self.crowded, self.at, self.left, self.tries, self.drive, self.flags, self.chords]
+        device.launch_serial(k.advance, [len(self.movers), self.leaders, fraction, self.count, *states])
+        self._aim(x_start)
+
+
+def _towards(now: np.ndarray, goal: np.ndarray, within: float) -> np.ndarray:
+    """(k, 3) m: goal, or as far from `now` on the straight ways there as takes nobody further than `within`, m."""
+    length = float(np.linalg.norm(goal - now, axis=1).max(initial=0.0))
+    return goal if length <= within else now + within / length * (goal - now)
+
+
+def _waypoints(paths: list, first: float, last: float) -> np.ndarray:
+    """(k,) times, ascending to `last`, between which each of the paths, with its mover, is straight, or turns by no more than it may."""
+    least = 1e-9 * (last - first)
+    breaks = [t for _, path in paths for t in path.breaks if first + least < t < last - least]
+    times = []
+    for a, b in itertools.pairwise(np.unique([first, *breaks, last])):
+        count = max([1, *(mover.chords(path, a, b) for mover, path in paths)])
+        times += [*(a + (b - a) * np.arange(1, count) / count), b]
+    return np.array(times or [last])

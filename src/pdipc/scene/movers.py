@@ -1,0 +1,78 @@
+"""What moves as told: obstacles, and the vertices that pins hold exactly; and into how many chords their turns are cut."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdipc.scene.assembly import Assembly
+from pdipc.scene.motion import Approach, Deforming, Trajectory
+
+CHORD = 0.2  # of the least separation of an obstacle's pairs: how far its chords may be from their arcs (`integration.script`)
+MOST = 4096  # chords of a step
+
+
+@dataclass
+class Mover:
+    """Vertices (k,) that a script or a command leads together: an obstacle, or what a pin holds exactly.
+
+    points: (k, 3) m, where they are when their trajectory has not moved them. body: which obstacle, pin: which pin, -1 for none.
+    deviation: m, of chords. origin: (3,) m, where the mesh's origin is at the start.
+    """
+
+    label: str
+    vertices: np.ndarray
+    points: np.ndarray
+    trajectory: Trajectory | Deforming
+    body: int
+    pin: int
+    deviation: float
+    origin: np.ndarray
+
+    @functools.cached_property
+    def still(self) -> bool:
+        """Whether its script never moves it."""
+        return self.trajectory.is_static
+
+    @property
+    def rigid(self) -> bool:
+        """Whether it is an obstacle that does not deform."""
+        return self.body >= 0 and self.trajectory.is_rigid
+
+    def reach(self, path: Trajectory | Approach) -> float:
+        """m: of the farthest point from the center of the path's turns."""
+        return float(np.linalg.norm(self.points - path.center, axis=1).max(initial=0.0))
+
+    def chords(self, path: Trajectory | Approach, first: float, last: float) -> int:
+        """How many chords a turn between two times needs, with no break in between (`scene.motion`)."""
+        angle = (last - first) * path.turning(first, last)
+        return max(1, int(np.ceil(angle * np.sqrt(self.reach(path) / (8.0 * self.deviation)))))
+
+
+def movers_of(assembly: Assembly) -> list[Mover]:
+    """The obstacles, then the pins that hold exactly."""
+    thinnest = min(body.half_separation for body in assembly.bodies if not body.kinematic)
+    found = []
+    for number, body in enumerate(assembly.bodies):
+        if body.trajectory is not None:
+            vertices = np.arange(body.first, body.last)
+            deviation = CHORD * (body.half_separation + thinnest)
+            label = f'obstacle "{body.name}"'
+            found.append(
+                Mover(label, vertices, assembly.positions[vertices], body.trajectory, number, -1, deviation, body.origin)
+            )
+    for number, pin in enumerate(assembly.pins):
+        if pin.stiffness is None and len(pin.vertices):
+            points = assembly.positions[pin.vertices]
+            deviation = assembly.activation_distance
+            found.append(Mover(pin.where, pin.vertices, points, pin.trajectory, -1, number, deviation, np.zeros(3)))
+    return found
+
+
+def most_chords(mover: Mover, h: float) -> float:
+    """The most chords that a step of h, s, may need, without a break; what is not finite is refused for other reasons."""
+    if not isinstance(mover.trajectory, Trajectory) or not len(mover.vertices):
+        return 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        needed = np.ceil(h * mover.trajectory.fastest() * np.sqrt(mover.reach(mover.trajectory) / (8.0 * mover.deviation)))
+    return max(1.0, float(needed)) if np.isfinite(mover.points).all() else 1.0
