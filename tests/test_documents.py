@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
+NEEDS = {"pictures": "pyvista", "rods": "pdipc"}
 
 
-@pytest.mark.parametrize("page", ["pictures"])
+@pytest.mark.parametrize("page", NEEDS)
 def test_python_of_the_page(page):
-    pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
+    pytest.importorskip(NEEDS[page], reason=f"needs {NEEDS[page]} (extra: {page})")
     names: dict = {}
     text = (DOCS / f"{page}.md").read_text()
     blocks = list(re.finditer(r"```python\n(.*?)```", text, flags=re.DOTALL))

@@ -8,8 +8,9 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from pdipc import cloth, constraints
+from pdipc import cloth, constraints, rods
 from pdipc.collision import surface
+from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.constraints import (
     corotated,
     edge_length,
@@ -29,7 +30,7 @@ from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
-from pdipc.scene.schema import ClothMaterial, Scene, SolidMaterial, uses_newton
+from pdipc.scene.schema import ClothMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -112,7 +113,7 @@ class Model:
     """What stays constant: topology, masses, constraints, the global matrix and its solver, the contact surface.
 
     Arrays over all n vertices, simulated and kinematic: mass (n,) kg, 0 where kinematic; free (n,) 1 or 0;
-    half_separation (n,) m, a vertex's part of a pair's minimum separation; friction (n,); kappa (n,) N/m, barrier stiffness;
+    half_separation (n,) m, a vertex's part of a pair's minimum separation, and rest_separation (n,), see `Candidates`; friction (n,); kappa (n,) N/m, barrier stiffness;
     body_mass (n,) kg, that of a vertex's body, 0 where kinematic; rigidity (n,), how far
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
     solver: of the local-global method, else None. free_vertices: (n,) bool; held: (n,) kg/s^2, what a common motion of all costs each:
@@ -128,6 +129,7 @@ class Model:
     mass: wp.array
     free: wp.array
     half_separation: wp.array
+    rest_separation: wp.array
     friction: wp.array
     kappa: wp.array
     body_mass: wp.array
@@ -239,6 +241,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
     per_vertex = {
         "friction": np.zeros(n),
         "half_separation": np.zeros(n),
+        "rest_separation": np.full(n, REST_SEPARATION),
         "kappa": np.zeros(n),
         "body_mass": np.zeros(n),
         "rigidity": np.ones(n),
@@ -247,6 +250,8 @@ def build(scene: Scene, device: str | None = None) -> Model:
         own = slice(body.first, body.last)
         per_vertex["friction"][own] = body.friction
         per_vertex["half_separation"][own] = body.half_separation
+        if body.kind == "rod":
+            per_vertex["rest_separation"][own] = ROD_SEPARATION
         if not body.kinematic:
             per_vertex["kappa"][own] = scene.contact.stiffness_scale * mass[own].mean() / (h * h)
             per_vertex["body_mass"][own] = mass[own].sum()
@@ -282,6 +287,7 @@ def build(scene: Scene, device: str | None = None) -> Model:
         mass=upload(mass),
         free=upload(free),
         half_separation=upload(per_vertex["half_separation"]),
+        rest_separation=upload(per_vertex["rest_separation"]),
         friction=upload(per_vertex["friction"]),
         kappa=upload(per_vertex["kappa"]),
         body_mass=upload(per_vertex["body_mass"]),
@@ -315,11 +321,14 @@ def _tolerance(sim, assembly: Assembly) -> float:
     return min(TOLERANCE_SPEED * h, TOLERANCE_PART * smallest)
 
 
-def _speed_of_sound(of: SolidMaterial | ClothMaterial) -> float:
+def _speed_of_sound(of: SolidMaterial | ClothMaterial | RodMaterial) -> float:
     """m/s, along the body."""
     if isinstance(of, SolidMaterial):
         return float(np.sqrt(of.young_modulus / of.density))
-    assert of.membrane_stiffness is not None  # its validator has set it
+    if isinstance(of, RodMaterial):
+        assert of.stretch_stiffness is not None  # its validator has set it
+        return float(np.sqrt(of.stretch_stiffness / (of.density * np.pi * of.radius**2)))
+    assert of.membrane_stiffness is not None
     return float(np.sqrt(of.membrane_stiffness / of.areal_density))
 
 
@@ -344,6 +353,10 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
         elif isinstance(m, ClothMaterial):
             own, its_mass = cloth.elasticity(assembly, body)
+            sets += own
+            mass += its_mass
+        elif isinstance(m, RodMaterial):
+            own, its_mass = rods.elasticity(x, body, m)
             sets += own
             mass += its_mass
     for pin in assembly.pins:

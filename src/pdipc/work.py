@@ -66,6 +66,7 @@ class Work:
             model.half_separation,
             settings.activation_distance,
             settings.margin,
+            model.rest_separation,
         )
         self.truncation = Truncation(device, real, n, settings.per_vertex_truncation)
         self.truncation.keep_rigid(self.script.rigid())

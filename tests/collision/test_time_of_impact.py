@@ -154,3 +154,28 @@ def test_bad_input_is_refused(change, message):
     points, kind = arguments.pop("points"), arguments.pop("kind")
     with pytest.raises(ValueError, match=message):
         time_of_impact(points, kind, **arguments)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("separation", [0.0, 0.05])
+def test_segments_of_rods_are_triangles_without_area(precision, separation):
+    """A vertex that passes a segment (a, b, b): no answer is late, and few are early."""
+    rng = np.random.default_rng(4)
+    points = rng.standard_normal((400, 8, 3)).astype(precision).astype(float)
+    points[:, 3], points[:, 7] = points[:, 2], points[:, 6]
+    # so that at half of the way the vertex is near the segment, as near as 1e-8
+    middle, part = 0.5 * (points[:, :4] + points[:, 4:]), rng.random((400, 1))
+    aim = (1 - part) * middle[:, 1] + part * middle[:, 2] + 10.0 ** rng.uniform(-8, 0, (400, 1)) * rng.standard_normal((400, 3))
+    points[:, 4] = (2 * aim - points[:, 0]).astype(precision)
+    times = time_of_impact(points, "vertex_triangle", minimum_separation=separation, precision=precision, device="cpu")
+    assert len(unproven(points, "vertex_triangle", times, separation)) == 0
+    s = np.linspace(0, 1, 1001)[:, None, None]
+    p, a, b = ((1 - s) * points[:, k] + s * points[:, 4 + k] for k in range(3))
+    along = np.clip(np.einsum("tij,tij->ti", p - a, b - a) / np.einsum("tij,tij->ti", b - a, b - a), 0, 1)
+    distance = np.linalg.norm(p - a - along[..., None] * (b - a), axis=2)
+    meets = (distance <= separation).any(axis=0)
+    first = np.where(meets, np.argmax(distance <= separation, axis=0) / 1000, np.inf)
+    assert (times <= first).all()
+    if separation:
+        assert np.isinf(times[~meets]).mean() > 0.4  # the others come nearer than the backoff, or turn
+        assert np.mean(first[meets] - times[meets]) < 0.02

@@ -13,6 +13,9 @@ from pdipc.constraints import (
     edge_length,
     enclosed_volume,
     neo_hookean,
+    rod_bending,
+    rod_frames,
+    rod_ghost,
     stitch,
     tet_strain,
     tet_volume,
@@ -24,6 +27,7 @@ from pdipc.device.precision import real
 
 SOLIDS = (tet_strain, tet_volume, corotated, neo_hookean)
 SHEETS = (triangle_strain, triangle_area)
+RODS = (rod_bending, rod_frames, rod_ghost)
 DEVICE, PRECISION = Device("cpu", threads=1), real("float64")
 STEP, RELATIVE = 1e-5, 1e-6  # m of the differences, and what they are good for, of elements of about a metre
 
@@ -66,6 +70,15 @@ def elements(kind, rng):
         for e, pull in enumerate((1.0, 1.5, 0.5, 0.1)):
             now[2 * e + 1] = now[2 * e] + pull * (rest[2 * e + 1] - rest[2 * e])
         return rest, now, kind.rest(rest, vertices, 2.0)
+    if kind in RODS:
+        corners = kind.CORNERS
+        straight = np.array([[0, 0, 0], [1, 0, 0], [2.1, 0, 0]][: 2 if kind is rod_ghost else 3], dtype=float)
+        ghosts = np.array([[0.5, 0.4, 0], [1.6, 0, -0.5]][: corners - len(straight)], dtype=float).reshape(-1, 3)
+        each = np.concatenate([straight, ghosts])
+        rest = np.concatenate([each + 0.1 * k * rng.standard_normal(each.shape) for k in range(5)])
+        vertices = np.arange(5 * corners, dtype=np.int32).reshape(5, corners)
+        stiffness = (2.0, 3.0) if kind is rod_frames else (2.0,)
+        return rest, rest + 0.3 * rng.standard_normal(rest.shape), kind.rest(rest, vertices, *stiffness)
     hinge = np.array([[0, 0, 0], [1, 0, 0], [0.4, 0.8, 0.3], [0.6, -0.9, 0.2]])
     rest = np.concatenate([hinge + 0.1 * rng.standard_normal((4, 3)) for _ in range(5)])
     triangles = np.array([t for k in range(0, 20, 4) for t in ([k, k + 1, k + 2], [k + 1, k, k + 3])], dtype=np.int32)
@@ -116,7 +129,8 @@ def prepared(kind, seed=0):
     return projector, rest, now - rest, s.vertices
 
 
-BENDING = [*SOLIDS, *SHEETS, edge_length, curved_bending, stitch]
+ROWS = [*SOLIDS, *SHEETS, edge_length, curved_bending, stitch, rod_bending]
+BENDING = [*ROWS, rod_frames, rod_ghost]
 
 
 def test_every_kind_that_bends_is_tested():
@@ -132,7 +146,7 @@ def test_hessians_are_derivatives_of_forces(kind):
         assert np.abs(found - expected[e]).max() <= RELATIVE * np.abs(expected[e]).max(), f"element {e}"
 
 
-@pytest.mark.parametrize("kind", BENDING, ids=lambda kind: kind.NAME)
+@pytest.mark.parametrize("kind", ROWS, ids=lambda kind: kind.NAME)
 def test_projected_hessians_are_the_nearest_positive_semidefinite(kind):
     """In terms of F, or G x: on its derivative G the negative eigenvalues are zero, and the others what they were."""
     projector, base, u, vertices = prepared(kind)
@@ -169,3 +183,15 @@ def test_degenerate_elements_have_finite_hessians(kind, project):
     assert np.isfinite(found).all()
     if project:
         assert all(np.linalg.eigvalsh(h)[0] > -1e-9 * (1.0 + np.abs(h).max()) for h in found)
+
+
+@pytest.mark.parametrize("kind", [rod_frames, rod_ghost], ids=lambda kind: kind.NAME)
+def test_hessians_of_rods_are_semidefinite_where_that_is_asked_for(kind):
+    """And what they were at rest, where nothing is to be left out."""
+    projector, base, u, vertices = prepared(kind)
+    for now, same in ((u, False), (np.zeros_like(u), kind is rod_frames)):
+        exact, projected = (blocks(projector, base, now, vertices.shape[1], flag) for flag in (0, 1))
+        for e in range(len(vertices)):
+            size = np.abs(projected[e]).max()
+            assert np.linalg.eigvalsh(projected[e])[0] >= -1e-12 * size
+            assert not same or np.abs(projected[e] - exact[e]).max() < 1e-12 * size

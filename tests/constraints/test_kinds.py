@@ -14,6 +14,9 @@ from pdipc.constraints import (
     neo_hookean,
     point_attachment,
     quadratic_bending,
+    rod_bending,
+    rod_frames,
+    rod_ghost,
     stitch,
     tet_strain,
     tet_volume,
@@ -68,6 +71,13 @@ def make(kind, rng):
     if kind is point_attachment:
         x = rng.standard_normal((4, 3))
         return x, kind.rest(x[:3], np.arange(3), 2.0)
+    if kind in (rod_bending, rod_frames, rod_ghost):
+        # a bent chain of three segments with their ghost points
+        x = np.array([[0, 0, 0], [1, 0, 0], [2, 0.3, 0], [2.7, 1, 0.2], [0.5, 0.5, 0], [1.5, 0.15, 0.6], [2.85, 0.15, 0.1]])
+        joints = np.array([[0, 1, 2, 4, 5], [1, 2, 3, 5, 6]], dtype=np.int32)
+        if kind is rod_frames:
+            return x, kind.rest(x, joints, 2.0, 3.0)
+        return x, kind.rest(x, joints[:, :3] if kind is rod_bending else joints[:, [0, 1, 3]], 2.0)
     x, triangles = sheet(rng, height=0.2 if kind is curved_bending else 0.0)
     if kind is edge_length:
         return x, kind.rest(x, triangles[:, :2], 2.0)

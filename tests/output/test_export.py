@@ -63,7 +63,7 @@ def test_usd(run, tmp_path, suffix):
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(0.03)
     for body, mesh in enumerate(meshes):
-        vertices, triangles = run.body_mesh(body)
+        vertices, triangles = run.skins[body].sources, run.skins[body].triangles
         assert mesh.GetPointsAttr().GetTimeSamples() == [0.0, 1.0, 2.0, 3.0]
         for frame in (0, 2):
             points = np.array(mesh.GetPointsAttr().Get(frame))

@@ -1,8 +1,11 @@
 """Small scenes for the physics tests, and the witness that watches every outer iteration."""
 
+from dataclasses import replace
+
 import numpy as np
 
 import pdipc
+from pdipc.scene import check
 
 
 def solid(name, size, cells, *, at=(0, 0, 0), rotation=(0, 0, 0), young=1e5, poisson=0.0, density=1000.0, **more):
@@ -18,6 +21,16 @@ def cloth(name, size, cells, *, at=(0, 0, 0), rotation=(0, 0, 0), **more):
     return {"name": name, "kind": "cloth", "mesh": mesh, "translation": at, "rotation": rotation, **more}
 
 
+def rod(
+    name, length, segments, *, at=(0, 0, 0), rotation=(0, 0, 0), radius=5e-3, young=1e6, poisson=0.3, density=1000.0, **more
+):
+    """A straight rod along x before rotation, its middle at `at`."""
+    mesh = {"shape": "rope", "length": length, "segments": segments}
+    stiffness = {name: more.pop(name) for name in ("stretch_stiffness", "bending_stiffness", "twist_stiffness") if name in more}
+    material = {"radius": radius, "young_modulus": young, "poisson_ratio": poisson, "density": density, **stiffness}
+    return {"name": name, "kind": "rod", "mesh": mesh, "translation": at, "rotation": rotation, "material": material, **more}
+
+
 def floor(size=10.0, *, rotation=(0, 0, 0), name="floor", at=(0, 0, 0), **more):
     """A plane that faces up."""
     mesh = {"shape": "plane", "size": size}
@@ -31,7 +44,7 @@ def scene(bodies, obstacles=(), *, contact=None, **simulation):
 
 
 class Witness:
-    """Watches every committed motion of a simulation: at its end no two triangles may intersect."""
+    """Watches every committed motion of a simulation: at its end no two triangles, nor segments of rods, may intersect."""
 
     def __init__(self, simulation):
         self.triangles, self.checked = simulation.triangles, 0
@@ -48,3 +61,9 @@ def watched(scene_or_model):
     simulation = pdipc.Simulation(scene_or_model, device="cpu")
     simulation.observe = Witness(simulation)
     return simulation
+
+
+def too_near(simulation):
+    """What is nearer than its minimum separation, the thickness of rods and cloth: measured without the code of the contact."""
+    assembly = replace(simulation.model.assembly, positions=simulation.positions)
+    return list(check.too_close(assembly, set(), "float64"))

@@ -124,7 +124,7 @@ def test_time_samples_of_usd(tmp_path):
         ({"V": FRAMES + np.array([0, np.inf, 0]), "times": TIMES}, "frame 0, vertex 0 = [-0.5, inf, -0.5] is not finite"),
         ({"V": FRAMES[:, :-1], "times": TIMES}, "the cache has frames of 48 vertices; its mesh has 49"),
         ({"V": FRAMES[0]}, "holds one frame only; needed: several"),
-        ({"W": FRAMES}, "needed: V and T (tets) or F (triangles)"),
+        ({"W": FRAMES}, "needed: V and T (tets), F (triangles) or L (lines)"),
         ({"V": FRAMES.astype(complex), "times": TIMES}, "they must be numbers (frames, n, 3)"),
         (None, "there is no such file"),
     ],

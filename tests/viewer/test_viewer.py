@@ -45,7 +45,7 @@ def test_vertices_are_updated_in_place_and_buttons_obeyed(live):
     moved = live.simulation.positions
     assert moved[0, 1] < first[0, 1]
     assert all(mesh is now for mesh, now in zip(meshes, live.view.meshes, strict=True))
-    np.testing.assert_array_equal(meshes[0].vertices, moved[live.view.vertices[0]].astype(np.float32))
+    np.testing.assert_array_equal(meshes[0].vertices, moved[live.view.skins[0].sources].astype(np.float32))
     assert "time 0.010 s" in live.report.content
 
     live.running.value = False
@@ -57,7 +57,7 @@ def test_vertices_are_updated_in_place_and_buttons_obeyed(live):
     live.todo.append(live.reset)
     live.advance()
     assert "time 0.000 s" in live.report.content
-    np.testing.assert_array_equal(meshes[0].vertices, first[live.view.vertices[0]].astype(np.float32))
+    np.testing.assert_array_equal(meshes[0].vertices, first[live.view.skins[0].sources].astype(np.float32))
 
 
 @pytest.mark.parametrize("live", [SOLID, CLOTH], indirect=True)
@@ -113,7 +113,7 @@ def test_playback_follows_the_clock_and_the_slider(tmp_path):
         return shown.view.meshes[1].vertices
 
     def cloth(frame: int) -> np.ndarray:
-        return run.positions(frame)[shown.view.vertices[1]].astype(np.float32)
+        return run.positions(frame)[shown.view.skins[1].sources].astype(np.float32)
 
     try:
         shown.advance(0.0)

@@ -35,6 +35,7 @@ REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distanc
 ROUNDING = 1.0e-5  # relative, of all that a reach is made of
 LEAST_MARGIN = 1.0e-100  # m
 REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as minimum separation, at most
+ROD_SEPARATION = 0.7  # the same of rods, which are as thick as their radius also where they touch themselves
 
 
 @functools.cache
@@ -45,12 +46,20 @@ def kernels(real: Real) -> SimpleNamespace:
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
 
     @wp.func
-    def limits(a: int, b: int, rest_distance: scalar, half_separation: wp.array(dtype=scalar), d_hat: scalar, same: bool):
+    def limits(
+        a: int,
+        b: int,
+        rest_distance: scalar,
+        half_separation: wp.array(dtype=scalar),
+        rest_separation: wp.array(dtype=scalar),
+        d_hat: scalar,
+        same: bool,
+    ):
         """(xi, d_hat) of a pair: smaller for a pair of one body that is close in the rest shape, so that rest is at rest."""
         xi = half_separation[a] + half_separation[b]
         reach = d_hat
         if same:
-            xi = wp.min(xi, scalar(REST_SEPARATION) * rest_distance)
+            xi = wp.min(xi, rest_separation[a] * rest_distance)
             reach = wp.min(reach, scalar(REST_FRACTION) * rest_distance - xi)
         return vec2(xi, reach)
 
@@ -63,6 +72,7 @@ def kernels(real: Real) -> SimpleNamespace:
         body: wp.array(dtype=wp.int32),
         rest: wp.array(dtype=vec3),
         half_separation: wp.array(dtype=scalar),
+        rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
@@ -77,7 +87,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 rest_distance = scalar(0.0)
                 if same:
                     rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
-                limits_out[k] = limits(v, t[0], rest_distance, half_separation, d_hat, same)
+                limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, same)
 
     @wp.kernel(module=module)
     def edge_edge_limits(
@@ -88,6 +98,7 @@ def kernels(real: Real) -> SimpleNamespace:
         body: wp.array(dtype=wp.int32),
         rest: wp.array(dtype=vec3),
         half_separation: wp.array(dtype=scalar),
+        rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
@@ -102,7 +113,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 rest_distance = scalar(0.0)
                 if same:
                     rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
-                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, d_hat, same)
+                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, same)
 
     @wp.kernel(module=module)
     def clear(first: int, away_out: wp.array(dtype=wp.int32)):
@@ -193,6 +204,7 @@ class Candidates:
 
     Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
     the device; what was listed is then incomplete, and the caller has to `grow` and list again.
+    rest_separation: (n,) the part of its distance at rest that a pair of one body keeps at most, REST_SEPARATION where None.
     needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
     """
 
@@ -206,8 +218,12 @@ class Candidates:
         half_separation: wp.array,
         activation_distance: float,
         margin: float,
+        rest_separation: wp.array | None = None,
     ):
         n = len(rest_positions)
+        if rest_separation is None:
+            rest_separation = wp.full(n, real.scalar(REST_SEPARATION), dtype=real.scalar, device=device.warp)
+        self.rest_separation = rest_separation
         self.device, self.real, self.surface, self.broad_phase = device, real, surface, broad_phase
         self.half_separation, self.activation_distance, self.margin = half_separation, activation_distance, margin
         self.kernels = kernels(real)
@@ -255,7 +271,8 @@ class Candidates:
         them at the same fraction of it."""
         self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
         self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
-        common = [self.surface.body_of_vertex, self.rest, self.half_separation, self.activation_distance]
+        common = [self.surface.body_of_vertex, self.rest, self.half_separation]
+        common += [self.rest_separation, self.activation_distance]
         primitives = (self.surface.triangles, self.surface.edges)
         for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
             inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]

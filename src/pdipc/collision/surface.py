@@ -18,7 +18,7 @@ MORTON_BITS = 20  # of each coordinate
 class Surface:
     """Primitives of all bodies and obstacles.
 
-    triangles: (m,) vec3i; edges: (k,) vec2i, each edge of a triangle once, ends in ascending order; vertices: (s,) int32, those
+    triangles: (m,) vec3i, segments of rods as (a, b, b), without area; edges: (k,) vec2i, each edge of a triangle once, ends in ascending order; vertices: (s,) int32, those
     that have a triangle; body_of_vertex: (n,) int32; obstacle: (n,) int32, 1 where the vertex is an obstacle's (obstacles may
     pass through each other; a body's held vertices may meet nothing, or an edge that they pull would pass through).
     members: vertices (s, 1), edges (k, 2) and triangles (m, 3) as NumPy arrays; codes: their Morton codes, uint64, ascending
@@ -38,6 +38,7 @@ class Surface:
 def unique_edges(triangles: np.ndarray) -> np.ndarray:
     """(k, 2) int32: the edges of triangles (m, 3), each once, in ascending order."""
     pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]  # a segment of a rod (a, b, b) has one
     return np.unique(pairs, axis=0).astype(np.int32)
 
 

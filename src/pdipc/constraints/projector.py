@@ -14,6 +14,9 @@ from pdipc.constraints import (
     neo_hookean,
     point_attachment,
     quadratic_bending,
+    rod_bending,
+    rod_frames,
+    rod_ghost,
     stitch,
     tet_strain,
     tet_volume,
@@ -37,6 +40,9 @@ KINDS = (
     curved_bending,
     enclosed_volume,
     stitch,
+    rod_bending,
+    rod_frames,
+    rod_ghost,
     point_attachment,
 )
 

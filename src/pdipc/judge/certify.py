@@ -60,7 +60,9 @@ def certify(run: Run, progress: Callable[[int, int], None] | None = None) -> Cer
     certificate = Certificate(judge=f"ipctk {ipctk.__version__}, Tight Inclusion CCD; what it accuses: exact arithmetic")
     used, triangles = np.unique(run.triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3).astype(np.int32)
-    edges = ipctk.edges(triangles)
+    rods = triangles[:, 1] == triangles[:, 2]  # segments (a, b, b): to this judge, edges without triangles
+    segments, triangles = triangles[rods, :2], triangles[~rods]
+    edges = np.concatenate([ipctk.edges(triangles), segments]).astype(np.int32)
     obstacle = run.obstacle[used]
     mesh = ipctk.CollisionMesh(run.positions(0)[used], edges, triangles)
     mesh.can_collide = ipctk.make_vertex_patches_filter(np.where(obstacle, 0, 1 + np.arange(len(used))).astype(np.int32))

@@ -19,7 +19,7 @@ UNDERFLOW = 1e-290  # far above what a product loses by underflow; times the fac
 def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: np.ndarray | None = None) -> np.ndarray:
     """All pairs of triangles that have a point in common which is no part of a vertex or edge that they share.
 
-    positions: (n, 3). triangles: (m, 3) indices. obstacle: (n,) bool, vertices of obstacles; triangles of obstacles may meet
+    positions: (n, 3). triangles: (m, 3) indices; a segment of a rod is a triangle without area, (a, b, b). obstacle: (n,) bool, vertices of obstacles; triangles of obstacles may meet
     each other, as a post stands in a floor, and such pairs are left out.
 
     Returns (k, 2) int64, i < j in each row, rows ascending; touching counts.
@@ -102,6 +102,8 @@ def _folded(positions, triangles, edges, owner, first) -> np.ndarray:
         for j in range(i + 1, counts.max()):
             edge = np.flatnonzero(counts > j)
             pair = np.column_stack([owner[first[edge] + i], owner[first[edge] + j]])
+            other = pair[:, 0] != pair[:, 1]  # a segment of a rod (a, b, b) has its edge twice
+            edge, pair = edge[other], pair[other]
             ends = edges[edge]
             # the third corner; where a triangle names a vertex twice, it has no area and folds onto nothing
             tips = [triangles[pair[:, k]].sum(axis=1) - ends.sum(axis=1) for k in (0, 1)]

@@ -41,6 +41,7 @@ class Excerpt(Run):
             "scripted": run.scripted[self._vertices],
             "body_names": run.topology["body_names"][kept],
             "body_kinds": run.topology["body_kinds"][kept],
+            "body_radii": run.topology["body_radii"][kept],
         }
 
     def positions(self, frame: int) -> np.ndarray:
@@ -62,26 +63,46 @@ def export(run: Run, to: str, path: str | Path) -> Path:
     return {"usd": export_usd, "ply": export_ply, "obj": export_obj, "vtk": export_vtk}[to](run, path)
 
 
+class _Surfaces:
+    """All vertices of a run, then the tubes of its rods. triangles: (m, 3) of these points; body: (m,) which each belongs to."""
+
+    def __init__(self, run: Run):
+        is_rod = np.array(run.body_kinds) == "rod"
+        first, triangles, body = len(run.topology["body_of_vertex"]), [run.triangles[~is_rod[run.body_of_triangle]]], []
+        body.append(run.body_of_triangle[~is_rod[run.body_of_triangle]])
+        self.tubes = [run.skins[rod] for rod in np.flatnonzero(is_rod)]
+        for rod, tube in zip(np.flatnonzero(is_rod), self.tubes, strict=True):
+            triangles.append(tube.triangles + first)
+            body.append(np.full(len(tube.triangles), rod))
+            first += len(tube.sources)
+        self.triangles, self.body = np.concatenate(triangles), np.concatenate(body)
+
+    def points(self, positions: np.ndarray) -> np.ndarray:
+        """(p, 3) m."""
+        return np.concatenate([positions, *(tube.points(positions) for tube in self.tubes)])
+
+
 def export_ply(run: Run, folder: Path) -> Path:
-    """frame_000000.ply, ...: the surfaces, binary, in float64, each triangle with its body's number."""
+    """frame_000000.ply, ...: the surfaces, binary, in float64, each triangle with its body's number; rods as tubes, after all vertices."""
     import trimesh
 
+    drawn = _Surfaces(run)
     for frame in range(run.frame_count):
-        mesh = trimesh.Trimesh(run.positions(frame), run.triangles, process=False)
-        mesh.face_attributes["body"] = run.body_of_triangle.astype(np.int32)
+        mesh = trimesh.Trimesh(drawn.points(run.positions(frame)), drawn.triangles, process=False)
+        mesh.face_attributes["body"] = drawn.body.astype(np.int32)
         data = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False, include_attributes=True)
         (folder / f"frame_{frame:06d}.ply").write_bytes(data)
     return folder
 
 
 def export_obj(run: Run, folder: Path) -> Path:
-    """frame_000000.obj, ...: the surfaces, an object a body, with digits that give the same float64 back."""
-    faces = []
+    """frame_000000.obj, ...: the surfaces, an object a body, with digits that give the same float64 back; rods as tubes."""
+    faces, drawn = [], _Surfaces(run)
     for body, name in enumerate(run.body_names):
-        corners = run.triangles[run.body_of_triangle == body] + 1
+        corners = drawn.triangles[drawn.body == body] + 1
         faces.append(f"o {name}\n" + "".join(f"f {a} {b} {c}\n" for a, b, c in corners.tolist()))
     for frame in range(run.frame_count):
-        vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in run.positions(frame).tolist())
+        vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in drawn.points(run.positions(frame)).tolist())
         (folder / f"frame_{frame:06d}.obj").write_text(vertices + "".join(faces))
     return folder
 
@@ -105,7 +126,7 @@ def export_vtk(run: Run, folder: Path) -> Path:
 
 
 def export_usd(run: Run, path: Path) -> Path:
-    """One .usd, .usda or .usdc file: a mesh a body below /Run, its points over time in seconds, y up, metres."""
+    """One .usd, .usda or .usdc file: a mesh a body below /Run, rods as tubes, points over time in seconds, y up, metres."""
     from pxr import Gf, Usd, UsdGeom, Vt
 
     if path.suffix.lower() not in USD_SUFFIXES:
@@ -122,7 +143,8 @@ def export_usd(run: Run, path: Path) -> Path:
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Run").GetPrim())
     meshes = []
     for body, (name, kind) in enumerate(zip(run.body_names, run.body_kinds, strict=True)):
-        vertices, triangles = run.body_mesh(body)
+        skin = run.skins[body]
+        triangles = skin.triangles
         mesh = UsdGeom.Mesh.Define(stage, f"/Run/{_identifier(name, body)}")
         mesh.GetPrim().SetMetadata("comment", name)
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
@@ -132,11 +154,11 @@ def export_usd(run: Run, path: Path) -> Path:
         color = OBSTACLE if kind == "obstacle" else PALETTE[body % len(PALETTE)]
         linear = [(int(color[k : k + 2], 16) / 255.0) ** 2.2 for k in (1, 3, 5)]
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear)])
-        meshes.append((vertices, mesh.CreatePointsAttr(), mesh.CreateExtentAttr()))
+        meshes.append((skin, mesh.CreatePointsAttr(), mesh.CreateExtentAttr()))
     for frame in range(run.frame_count):
-        positions = run.positions(frame).astype(np.float32)
-        for vertices, points, extent in meshes:
-            own = np.ascontiguousarray(positions[vertices])
+        positions = run.positions(frame)
+        for skin, points, extent in meshes:
+            own = np.ascontiguousarray(skin.points(positions).astype(np.float32))
             points.Set(Vt.Vec3fArray.FromNumpy(own), frame)
             extent.Set(Vt.Vec3fArray.FromNumpy(np.array([own.min(axis=0), own.max(axis=0)])), frame)
     stage.GetRootLayer().Save()

@@ -10,6 +10,7 @@ import numpy as np
 
 from pdipc.output import legend
 from pdipc.output.results import Run, RunError
+from pdipc.output.skins import Skin
 from pdipc.scene.looks import Look, Picture, looks
 
 if TYPE_CHECKING:
@@ -232,7 +233,8 @@ class Drawing:
     def _add_bodies(self, start: np.ndarray) -> None:
         run, settings = self.run, self.settings
         for body, (kind, look) in enumerate(zip(run.body_kinds, looks(run.scene, run.body_names), strict=True)):
-            vertices, triangles = run.body_mesh(body)
+            skin = run.skins[body]
+            vertices, triangles = skin.sources, skin.triangles
             obstacle = kind == "obstacle"
             if not len(triangles) or not look.visible or look.opacity == 0.0 or (obstacle and settings.obstacles == "hidden"):
                 continue
@@ -242,7 +244,7 @@ class Drawing:
                 continue
             opacity = look.opacity or (GLASS if obstacle and settings.obstacles == "translucent" else 1.0)
             color = look.color or (OBSTACLE if obstacle else PALETTE[body % len(PALETTE)])
-            self.bodies.append(_Body(self, body, start, vertices, triangles, kind, color, opacity, look))
+            self.bodies.append(_Body(self, body, start, skin, kind, color, opacity, look))
         if not isinstance(settings.ground, str):
             self.grounds.append(_Ground(self, Look(), None, settings.ground))
 
@@ -424,15 +426,14 @@ class Drawing:
 
 
 class _Body:
-    """The mesh of one body; its points are `vertices` of the run, doubled along sharp edges."""
+    """The mesh of one body: the points of its skin, doubled along sharp edges; vertices: those of the run that they belong to."""
 
     def __init__(
         self,
         drawing: Drawing,
         number: int,
         positions: np.ndarray,
-        vertices: np.ndarray,
-        triangles: np.ndarray,
+        skin: Skin,
         kind: str,
         color: str,
         opacity: float,
@@ -442,15 +443,15 @@ class _Body:
 
         settings, plotter = drawing.settings, drawing.plotter
         self.number, self.kind, self.look, self.color, self.plotter = number, kind, look, color, plotter
-        points, ids = positions[vertices], vertices
+        self.skin = skin
         self.weights: np.ndarray | None = None  # of the corners of a triangle, for points that are not vertices of the run
-        self.mesh = pyvista.PolyData.from_regular_faces(points, triangles)
-        self.mesh["vertex"] = ids
+        self.mesh = pyvista.PolyData.from_regular_faces(skin.points(positions), skin.triangles)
+        self.mesh["vertex"], self.mesh["point"] = skin.sources, np.arange(len(skin.sources))
         sharp = settings.sharp_edge if settings.sharp_edge is not None else 180.0 if kind == "cloth" else SHARP_EDGE
         if 0.0 < sharp < 180.0:
             self.mesh = self.mesh.compute_normals(split_vertices=True, feature_angle=sharp, consistent_normals=False)
         self.smooth = sharp > 0.0
-        self.vertices = np.asarray(self.mesh["vertex"])
+        self.vertices, self.places = np.asarray(self.mesh["vertex"]), np.asarray(self.mesh["point"])
         self.outline: Any = None
         self.uncut = self.mesh
         self.field = drawing.field is not None
@@ -515,9 +516,10 @@ class _Body:
 
     def move(self, positions: np.ndarray) -> None:
         """To where its vertices are."""
-        corners = positions[self.vertices]
-        points = corners if self.weights is None else np.einsum("ki,kij->kj", self.weights, corners)
-        self.mesh.points = points
+        if self.weights is None:
+            self.mesh.points = self.skin.points(positions)[self.places]
+        else:
+            self.mesh.points = np.einsum("ki,kij->kj", self.weights, positions[self.vertices])
         if self.outline is not None:
             self.outline.points = positions[np.asarray(self.outline["vertex"])]
         if self.smooth:

@@ -2,7 +2,7 @@
 
     run.json        what made it: versions, device, precision
     scene.json      the scene as it was read
-    topology.npz    triangles, tets, body_of_vertex, scripted, body_names, body_kinds
+    topology.npz    triangles, tets, body_of_vertex, scripted, body_names, body_kinds, body_radii
     frames/         000000.npy, ...: positions (n, 3) of each step, m
     stats.jsonl     a line per frame: step, time, statistics of the step
     run.vtkhdf      the same frames for ParaView, up to the last checkpoint
@@ -34,6 +34,7 @@ import numpy as np
 
 from pdipc.forces import ContactForces
 from pdipc.output import lock
+from pdipc.output.skins import Skin, skin
 
 FORMAT = 1
 FOLDERS = ("frames", "forces", "checkpoints", "segments")
@@ -336,7 +337,7 @@ class Run:
 
     @cached_property
     def body_kinds(self) -> list[str]:
-        """Per body: "solid", "cloth" or "obstacle"."""
+        """Per body: "solid", "cloth", "rod" or "obstacle"."""
         return [str(kind) for kind in self.topology["body_kinds"]]
 
     @cached_property
@@ -344,10 +345,14 @@ class Run:
         """(m,) index into body_names."""
         return self.topology["body_of_vertex"][self.triangles[:, 0]]
 
-    def body_mesh(self, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """Surface of one body: the vertices it uses (k,), and its triangles (m, 3) as indices into those."""
-        vertices, triangles = np.unique(self.triangles[self.body_of_triangle == body], return_inverse=True)
-        return vertices, triangles.reshape(-1, 3).astype(np.int32)
+    def skin(self, body: int) -> Skin:
+        """What is drawn of one body."""
+        return skin(self.triangles[self.body_of_triangle == body], float(self.topology["body_radii"][body]))
+
+    @cached_property
+    def skins(self) -> list[Skin]:
+        """What is drawn of each body."""
+        return [self.skin(body) for body in range(len(self.body_names))]
 
     def segments(self) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
         """Step, outer iteration, start (n, 3) and end (n, 3) of every motion recorded for the frames that count."""
@@ -419,6 +424,7 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "scripted": ("b", ("vertices",)),
     "body_names": ("U", ("bodies",)),
     "body_kinds": ("U", ("bodies",)),
+    "body_radii": ("f", ("bodies",)),
 }
 
 
@@ -427,6 +433,8 @@ def _read_topology(path: Path) -> dict[str, np.ndarray]:
         found = _read_arrays(path)
     except UNREADABLE as error:
         raise RunError(f"{path} cannot be read: {error}") from error
+    if "body_names" in found:
+        found.setdefault("body_radii", np.zeros(found["body_names"].shape))  # runs of earlier versions have no rods
     lengths: dict[str, int] = {}
     for name, (kinds, shape) in ARRAYS.items():
         if name not in found:

@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-CELL_TYPES = {"tetra": 10, "triangle": 5}  # VTK's numbers
+CELL_TYPES = {"tetra": 10, "triangle": 5, "line": 3}  # VTK's numbers
 # without locks: a run goes on while a reader holds the file, and what was written stays where it is
 OPENED = {"libver": ("v110", "v110"), "locking": False}
 DAMAGED = (OSError, KeyError, ValueError, RuntimeError)  # what h5py raises, by the place of the damage
@@ -25,10 +25,11 @@ SLACK = 1 << 18  # bytes that HDF5 takes beyond the arrays, at most
 
 
 def cells(topology: dict[str, np.ndarray]) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """What is drawn: the tets of solids, the triangles of cloth and obstacles. Kind, vertices (k, 3 or 4), body (k,) of each."""
+    """What is drawn: the tets of solids, the triangles of cloth and obstacles, the lines of rods. Kind, vertices (k, 2 to 4), body (k,)."""
     of_vertex, triangles = topology["body_of_vertex"], topology["triangles"]
-    hollow = np.asarray(topology["body_kinds"]) != "solid"
-    elements = {"tetra": topology["tets"], "triangle": triangles[hollow[of_vertex[triangles[:, 0]]]]}
+    kind = np.asarray(topology["body_kinds"])[of_vertex[triangles[:, 0]]]
+    surfaces, lines = triangles[(kind != "solid") & (kind != "rod")], triangles[kind == "rod", :2]
+    elements = {"tetra": topology["tets"], "triangle": surfaces, "line": lines}
     return [(kind, found, of_vertex[found[:, 0]].astype(np.int32)) for kind, found in elements.items() if len(found)]
 
 

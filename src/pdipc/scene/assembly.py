@@ -5,13 +5,13 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pdipc.scene import meshes, sewing
+from pdipc.scene import generators, meshes, rods, sewing
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
@@ -27,6 +27,8 @@ from pdipc.scene.schema import (
     Deformation,
     Obstacle,
     Placed,
+    Rod,
+    RodMaterial,
     Scene,
     Selection,
     Solid,
@@ -46,30 +48,44 @@ SEPARATION_PART = 0.02  # default minimum separation, of the activation distance
 class AssembledBody:
     """One body or obstacle; its vertices are first, ..., last - 1 of the whole.
 
-    tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward.
+    tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward; a rod's
+    are its segments (a, b, b). joints: (j, 2) int32, segments of a rod that follow each other. ghosts: (s,) int32, the points that mark
+    how its segments are twisted, the last of its vertices; none where it twists freely.
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
     trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. origin (3,) m and orientation (3, 3): where its
     mesh's origin and axes are at the start.
     """
 
     name: str
-    kind: Literal["solid", "cloth", "obstacle"]
+    kind: Literal["solid", "cloth", "rod", "obstacle"]
     first: int
     last: int
     tets: np.ndarray
     triangles: np.ndarray
-    material: SolidMaterial | ClothMaterial | None
+    material: SolidMaterial | ClothMaterial | RodMaterial | None
     half_separation: float
     friction: float
     trajectory: Trajectory | Deforming | None = None
     inside: Inside | None = None
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     orientation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    joints: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int32))
+    ghosts: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
 
     @property
     def kinematic(self) -> bool:
         """Whether all its vertices follow a script."""
         return self.kind == "obstacle"
+
+    @property
+    def count(self) -> int:
+        """Vertices of its mesh: those that a scene can name."""
+        return self.last - self.first - len(self.ghosts)
+
+    @property
+    def segments(self) -> np.ndarray:
+        """(s, 2) int32: of a rod."""
+        return self.triangles[:, :2] if self.kind == "rod" else self.triangles[:0, :2]
 
 
 @dataclass
@@ -212,7 +228,7 @@ class Assembly:
 
     def topology(self) -> dict[str, np.ndarray]:
         """What a result needs to be read without the scene, by name: tets (t, 4), body_of_vertex (n,), scripted (n,) bool,
-        body_names and body_kinds as text.
+        body_names and body_kinds as text, body_radii (bodies,) m, 0 for all but rods.
         """
         return {
             "tets": self.tets,
@@ -220,6 +236,7 @@ class Assembly:
             "scripted": self.scripted,
             "body_names": np.array([body.name for body in self.bodies]),
             "body_kinds": np.array([body.kind for body in self.bodies]),
+            "body_radii": np.array([getattr(body.material, "radius", 0.0) for body in self.bodies]),
         }
 
     def pin_targets(self, pin: AssembledPin, time: float) -> np.ndarray:
@@ -241,17 +258,31 @@ def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.nd
     source, start = placed.mesh, None
     try:
         if isinstance(source, str):
-            mesh = meshes.read(source, worker)
+            mesh = meshes.read_lines(source, worker) if isinstance(placed, Rod) else meshes.read(source, worker)
         elif isinstance(source, Arrays):
-            mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
+            if isinstance(placed, Rod):
+                lines = np.zeros((0, 2)) if source.lines is None else source.lines
+                mesh = meshes.lines_from_arrays(source.vertices, lines, "mesh", drop_unused=False)
+            else:
+                mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
             start = source.start
         else:
+            if isinstance(placed, Rod) != isinstance(source, generators.LINES):
+                right = ", ".join(f'"{shape.model_fields["shape"].default}"' for shape in generators.LINES)
+                raise SceneError(f'{where}: the shape "{source.shape}" does not fit; shapes of lines are for rods: {right}')
             _need(source.bytes(), where, f"{source.cell_count()} cells", "fewer cells")
             mesh = source.mesh()
     except SceneError as error:
         said = str(error)
         raise SceneError(said if said.startswith(where) else f"{where}: {said}") from error
-    if not isinstance(placed, Solid):
+    if isinstance(placed, Rod):
+        mesh.lines, mesh.joints = rods.in_order(mesh.lines, where)
+        mesh.triangles = mesh.lines[:, [0, 1, 1]]
+        for points in (mesh.vertices, mesh.vertices if start is None else start):
+            short = np.flatnonzero(rods.lengths(points, mesh.lines) == 0.0)
+            if len(short):
+                raise SceneError(f"{where}: the line {mesh.lines[short[0]].tolist()} has no length; its ends must be apart")
+    elif not isinstance(placed, Solid):
         if len(mesh.tets):
             mesh, start = mesh.surface(), None if start is None else start[np.unique(mesh.triangles)]
     elif not len(mesh.tets):
@@ -375,25 +406,32 @@ def gather(
         if frames is not None:
             deforming = Deforming(frames, placed.motion.start, matrix, placed.translation)
             rest = start = deforming.apply(None, 0.0)
+        center = meshes.center_of_mass(replace(mesh, vertices=start)) if isinstance(placed, Body) else np.zeros(3)
+        ghosts = np.zeros(0, dtype=np.int32)
+        if isinstance(placed, Rod) and placed.material.twist_stiffness:
+            marks = rods.ghost_points(rest, start, mesh.lines, mesh.joints, placed.material.radius)
+            ghosts = np.arange(len(rest), len(rest) + len(marks[0]), dtype=np.int32)
+            rest, start = np.concatenate([rest, marks[0]]), np.concatenate([start, marks[1]])
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
-                placed.kind if isinstance(placed, Solid | Cloth) else "obstacle",
+                placed.kind if isinstance(placed, Body) else "obstacle",
                 first,
                 first + len(rest),
                 mesh.tets + first,
                 mesh.triangles + first,
-                placed.material if isinstance(placed, Solid | Cloth) else None,
+                placed.material if isinstance(placed, Body) else None,
                 half_separation=0.0,
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
                 trajectory=deforming,
                 inside=placed.inside if isinstance(placed, Cloth) else None,
                 origin=np.array(placed.translation) + offset,
                 orientation=rotation_matrix(placed.rotation),
+                joints=mesh.joints,
+                ghosts=ghosts + first,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):
-                center = meshes.center_of_mass(Mesh(start, mesh.triangles, mesh.tets))
                 velocities = np.array(placed.velocity) + np.cross(placed.angular_velocity, start - center)
             parts.append((body, placed, Mesh(rest + offset, mesh.triangles, mesh.tets), start + offset, velocities))
             first = body.last
@@ -421,6 +459,8 @@ def gather(
     )
     for body, placed, _, start, _ in parts:
         body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
+        if isinstance(placed, Rod) and not placed.minimum_separation:
+            body.half_separation = placed.material.radius
         if isinstance(placed, Obstacle):
             body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
         else:
@@ -429,6 +469,7 @@ def gather(
                 with _noting(problems):
                     vertices = _select(assembly, body, pin.select, where)
                     trajectory = Trajectory(pin.motion, _middle(positions[vertices]))
+                    vertices = _with_ghosts(body, vertices)
                     where += f".select = {pin.select}"
                     assembly.pins.append(AssembledPin(where, body.name, vertices, trajectory, pin.stiffness))
     assembly.velocities[assembly.kinematic_vertices] = 0.0
@@ -489,7 +530,7 @@ def _pushed(assembly: Assembly, name: str, where: str) -> AssembledBody:
 
 def _select(assembly: Assembly, body: AssembledBody, select: Selection, where: str) -> np.ndarray:
     """(k,) int32, ascending; may be empty: the check reports that."""
-    points = assembly.positions[body.first : body.last]
+    points = assembly.positions[body.first : body.first + body.count]
     if select.vertices is not None:
         _in_range(body, select.vertices, where)
         chosen = np.unique(np.array(select.vertices, dtype=np.int32))
@@ -504,8 +545,15 @@ def _select(assembly: Assembly, body: AssembledBody, select: Selection, where: s
     return (chosen + body.first).astype(np.int32)
 
 
+def _with_ghosts(body: AssembledBody, vertices: np.ndarray) -> np.ndarray:
+    """The vertices, and the ghost points of segments that have both ends among them: who holds a segment holds its twist."""
+    if not len(body.ghosts):
+        return vertices
+    return np.concatenate([vertices, body.ghosts[np.isin(body.segments, vertices).all(axis=1)]])
+
+
 def _in_range(body: AssembledBody, vertices: list[int], where: str) -> None:
-    count = body.last - body.first
+    count = body.count
     beyond = [vertex for vertex in vertices if not 0 <= vertex < count]
     if beyond:
         raise SceneError(f"{where}: vertex {beyond[0]} is out of range; {_label(body)} has the vertices 0 to {count - 1}")
@@ -524,8 +572,8 @@ def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
     else:
         if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
             return  # the check says so
-        near = cKDTree(assembly.positions[b.first : b.last])
-        distance, nearest = near.query(assembly.positions[a.first : a.last], distance_upper_bound=table.within)
+        near = cKDTree(assembly.positions[b.first : b.first + b.count])
+        distance, nearest = near.query(assembly.positions[a.first : a.first + a.count], distance_upper_bound=table.within)
         chosen = np.flatnonzero(np.isfinite(distance))
         pairs = np.column_stack([chosen, nearest[chosen]])
     vertices_a, vertices_b = (pairs[:, 0] + a.first).astype(np.int32), (pairs[:, 1] + b.first).astype(np.int32)

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pdipc.judge import boxes
 from pdipc.judge.witness import find_intersections
-from pdipc.scene import meshes
+from pdipc.scene import meshes, rods
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
 from pdipc.scene.check_garments import check_garments
 from pdipc.scene.errors import SceneError
@@ -18,7 +18,7 @@ from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import MOST, most_chords, movers_of
-from pdipc.scene.schema import Cloth, Scene, local_global_settings, uses_newton
+from pdipc.scene.schema import Cloth, Rod, Scene, local_global_settings, uses_newton
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -32,7 +32,7 @@ ACTIVATION_PART, ACTIVATION_ULPS = 1e-7, 10
 # may take a part of the gap, and no more. Measured on a sheet over another, of one body: with gaps of 1e-6 of the activation
 # distance and below some steps do not converge and vertices hang in the air, with 1e-5 and above all fall.
 CLOSEST_PART, CLOSEST_ULPS = 1e-5, 10
-REST_SEPARATION = 0.2  # that of `pdipc.collision.candidates`
+REST_SEPARATION, ROD_SEPARATION = 0.2, 0.7  # those of `pdipc.collision.candidates`
 
 
 def check(scene: Scene | Assembly, precision: str | None = None) -> list[Finding]:
@@ -115,6 +115,13 @@ def _settings(scene: Scene) -> Iterator[Finding]:
         yield Finding("simulation.nonlinear_solver", found, "leave it out")
     newton = method != "paper" and uses_newton(sim)
     for body in scene.bodies:
+        if isinstance(body, Rod) and method == "paper":
+            yield Finding(
+                f'body "{body.name}"', "is a rod, which the paper's contact does not know", 'take contact.method = "barrier"'
+            )
+        elif isinstance(body, Rod) and body.material.twist_stiffness and not newton:
+            found = f"is {body.material.twist_stiffness:g} N m^2, and no local projection belongs to twist"
+            yield Finding(f'body "{body.name}": material.twist_stiffness', found, "set it to 0, or take the Newton solver")
         model = getattr(body.material, "model", "auto")
         if model in ("corotated", "neo_hookean") and not newton:
             found = f'is "{model}", which no local projection belongs to'
@@ -170,7 +177,7 @@ def _check(assembly: Assembly, precision: str, complete: bool = True) -> list[Fi
     touching, found = _intersections(assembly, precision)
     findings += [*found, *distances]
     if complete:
-        findings += _too_close(assembly, touching, precision)
+        findings += too_close(assembly, touching, precision)
     return findings + list(_inside(assembly, touching))
 
 
@@ -213,6 +220,9 @@ def _without(assembly: Assembly, names: set[str]) -> Assembly:
 
 def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     label, first = _label(body), body.first
+    if body.kind == "rod":
+        yield from _segments(assembly, body)
+        return
     kind, elements = ("tets", body.tets) if body.kind == "solid" else ("triangles", body.triangles)
     if body.kind == "solid":
         volumes = meshes.tet_volumes(assembly.rest_positions, elements)
@@ -261,6 +271,19 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     if len(unused):
         found = f"{len(unused)} vertices belong to no {kind[:-1]}, first vertex {unused[0] - first}"
         yield Finding(label, found, "remove them")
+
+
+def _segments(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
+    """Of a rod; what lines there may be is refused where they are read."""
+    length = rods.lengths(assembly.rest_positions, body.segments)
+    short = np.flatnonzero(length <= meshes.FLAT * length.max())
+    if len(short):
+        example = f"vertices {(body.segments[short[0]] - body.first).tolist()}"
+        yield Finding(_label(body), f"{len(short)} of {len(length)} segments have no length, first {example}", "remove them")
+    unused = np.setdiff1d(np.arange(body.first, body.first + body.count), body.segments)
+    if len(unused):
+        found = f"{len(unused)} vertices belong to no line, first vertex {unused[0] - body.first}"
+        yield Finding(_label(body), found, "remove them")
 
 
 def _fans(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -372,14 +395,15 @@ def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, i
         own = pairs[np.all(owners == (i, j), axis=1)]
         place = assembly.positions[triangles[own[0]]].mean(axis=(0, 1))
         where = _label(assembly.bodies[i]) + (f" and {_label(assembly.bodies[j])}" if i != j else "")
-        found = f"{len(own)} pairs of triangles intersect at the start, one near {_at(place)} m, in {precision} coordinates"
+        what = "segments and triangles" if "rod" in (assembly.bodies[i].kind, assembly.bodies[j].kind) else "triangles"
+        found = f"{len(own)} pairs of {what} intersect at the start, one near {_at(place)} m, in {precision} coordinates"
         findings.append(Finding(where, found, "move them apart" if i != j else "the surface must not pass through itself"))
         touching.add((int(i), int(j)))
     return touching, findings
 
 
-def _too_close(assembly: Assembly, touching: set[tuple[int, int]], precision: str) -> Iterator[Finding]:
-    """Pairs of bodies, or parts of one body, that come as near as their minimum separation."""
+def too_close(assembly: Assembly, touching: set[tuple[int, int]], precision: str) -> Iterator[Finding]:
+    """Pairs of bodies, or parts of one body, that come as near as their minimum separation; touching: pairs of bodies to leave out."""
     found = [_near_others(assembly), _near_itself(assembly, precision)]
     distances, limits, pairs, places = (np.concatenate(parts) for parts in zip(*found, strict=True))
     for i, j in np.unique(pairs, axis=0):
@@ -432,14 +456,15 @@ def _near_itself(assembly: Assembly, precision: str) -> Near:
     """
     x, owner = assembly.positions, assembly.body_of_vertex
     least = max(CLOSEST_PART * assembly.activation_distance, CLOSEST_ULPS * _rounding(assembly, precision))
-    reach = np.zeros(len(x))
+    reach, rod = np.zeros(len(x)), np.array([body.kind == "rod" for body in assembly.bodies])
     for body in assembly.bodies:
         own = slice(body.first, body.last)
         at_rest = np.array_equal(x[own], assembly.rest_positions[own].astype(precision).astype(np.float64))
         reach[own] = 0.5 * least if at_rest else max(body.half_separation, 0.5 * least)
 
     def limit(a: np.ndarray, b: np.ndarray, at_rest: np.ndarray) -> np.ndarray:
-        return np.maximum(np.minimum(reach[a] + reach[b], REST_SEPARATION * at_rest), least)
+        part = np.where(rod[owner[a]], ROD_SEPARATION, REST_SEPARATION)
+        return np.maximum(np.minimum(reach[a] + reach[b], part * at_rest), least)
 
     surface = np.concatenate([body.triangles for body in assembly.bodies if not body.kinematic])
     return _nearer(assembly, _primitives(surface), reach, lambda a, b: owner[a] == owner[b], limit)
@@ -448,6 +473,7 @@ def _near_itself(assembly: Assembly, precision: str) -> Near:
 def _primitives(triangles: np.ndarray) -> list[np.ndarray]:
     """Vertices (s, 1), edges (k, 2) and triangles (m, 3)."""
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    edges = edges[edges[:, 0] < edges[:, 1]]  # a segment of a rod (a, b, b) has one
     return [np.unique(triangles)[:, None], edges, triangles]
 
 

@@ -30,7 +30,7 @@ class Shape(Table):
 
     def bytes(self) -> int:
         """Memory that `mesh` needs, measured."""
-        return self.cell_count() * (250 if isinstance(self, Grid | Plane) else 2300)
+        return self.cell_count() * (250 if isinstance(self, (Grid, Plane, *LINES)) else 2300)
 
     def mesh(self) -> Mesh:
         """The shape about its origin: tets with their surface, or triangles for the open shapes."""
@@ -221,7 +221,97 @@ class Plane(Shape):
         return Grid(size=(self.size, self.size), cells=(1, 1)).mesh()
 
 
-SHAPES = (Box, Sphere, Cylinder, Capsule, Torus, Bowl, Stairs, Grid, Plane)
+class Rope(Shape):
+    """A straight line along x, centred at the origin, for rods."""
+
+    shape: Literal["rope"] = "rope"
+    length: Length = Field(default=1.0, description="Extent along x, m.")
+    segments: Count = Field(default=40, description="Number of segments.")
+
+    def cell_count(self) -> int:
+        return self.segments
+
+    def mesh(self) -> Mesh:
+        x = np.linspace(-0.5, 0.5, self.segments + 1) * self.length
+        ends = np.arange(self.segments)
+        return Mesh.of_lines(np.column_stack([x, 0 * x, 0 * x]), np.column_stack([ends, ends + 1]))
+
+
+class Ring(Shape):
+    """A closed circle in the plane of x and y, centred at the origin, for rods."""
+
+    shape: Literal["ring"] = "ring"
+    radius: Length = Field(default=0.1, description="Radius of the circle, m.")
+    segments: Annotated[Whole, Field(ge=3, le=4096)] = Field(default=24, description="Number of segments.")
+
+    def cell_count(self) -> int:
+        return self.segments
+
+    def mesh(self) -> Mesh:
+        angle = 2.0 * np.pi * np.arange(self.segments) / self.segments
+        points = self.radius * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+        ends = np.arange(self.segments)
+        return Mesh.of_lines(points, np.column_stack([ends, (ends + 1) % self.segments]))
+
+
+class Coil(Shape):
+    """A helix about y, centred at the origin, for rods."""
+
+    shape: Literal["coil"] = "coil"
+    radius: Length = Field(default=0.1, description="Radius of the helix, m.")
+    height: Length = Field(default=0.2, description="Extent along y, m.")
+    turns: Annotated[Real, Field(gt=0, le=1000, allow_inf_nan=False)] = Field(
+        default=5.0, description="How often it goes around."
+    )
+    segments: Count = Field(default=120, description="Number of segments.")
+
+    def cell_count(self) -> int:
+        return self.segments
+
+    def mesh(self) -> Mesh:
+        part = np.linspace(0.0, 1.0, self.segments + 1)
+        angle = 2.0 * np.pi * self.turns * part
+        points = [self.radius * np.cos(angle), self.height * (part - 0.5), self.radius * np.sin(angle)]
+        ends = np.arange(self.segments)
+        return Mesh.of_lines(np.column_stack(points), np.column_stack([ends, ends + 1]))
+
+
+class Knot(Shape):
+    """A rope along x with a loose overhand knot in its middle, for rods: Shastri's curve, which no pull at its ends undoes."""
+
+    shape: Literal["knot"] = "knot"
+    length: Length = Field(default=1.0, description="Length of the rope, m.")
+    segments: Annotated[Whole, Field(ge=20, le=4096)] = Field(default=120, description="Number of segments.")
+
+    def cell_count(self) -> int:
+        return self.segments
+
+    def mesh(self) -> Mesh:
+        t = np.linspace(-2.2, 2.2, 4001)
+        curve = np.column_stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.4 * (t**5 - 10 * t)])
+        curve[:, 1] -= curve[0, 1]
+        # straight on from both ends, along x, for as long as the knot itself
+        run = np.abs(curve[-1, 0] - curve[0, 0])
+        ends = [curve[0] - [run, 0, 0], curve[-1] + [run, 0, 0]]
+        curve = np.concatenate([ends[:1], curve, ends[1:]])
+        fine = _evenly(curve, 2000)
+        window = np.hanning(121) / np.hanning(121).sum()  # rounds the two corners
+        padded = np.pad(fine, ((60, 60), (0, 0)), mode="reflect", reflect_type="odd")
+        points = _evenly(np.column_stack([np.convolve(padded[:, axis], window, "valid") for axis in range(3)]), self.segments)
+        points *= self.length / np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        ends = np.arange(self.segments)
+        return Mesh.of_lines(points, np.column_stack([ends, ends + 1]))
+
+
+LINES = (Rope, Ring, Coil, Knot)
+SHAPES = (Box, Sphere, Cylinder, Capsule, Torus, Bowl, Stairs, Grid, Plane, *LINES)
+
+
+def _evenly(curve: np.ndarray, segments: int) -> np.ndarray:
+    """(segments + 1, 3): points at even distances along a curve (n, 3)."""
+    passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    at = np.linspace(0.0, passed[-1], segments + 1)
+    return np.column_stack([np.interp(at, passed, curve[:, axis]) for axis in range(3)])
 
 
 def lattice(cells: tuple[int, int, int], ring: bool = False) -> tuple[np.ndarray, np.ndarray]:

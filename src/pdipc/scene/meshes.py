@@ -30,19 +30,31 @@ def _no_tets() -> np.ndarray:
     return np.zeros((0, 4), dtype=np.int32)
 
 
+def _no_lines() -> np.ndarray:
+    return np.zeros((0, 2), dtype=np.int32)
+
+
 @dataclass
 class Mesh:
-    """A tetrahedral mesh, or a triangle mesh.
+    """A tetrahedral mesh, a triangle mesh, or the lines of a rod.
 
     vertices: (n, 3) float64, m. triangles: (m, 3) int32, the boundary of the tets where there are any, outward.
     tets: (t, 4) int32, of positive volume: (v1 - v0) x (v2 - v0) . (v3 - v0) > 0.
-    notes: what was left out of the file, or converted, a sentence each.
+    lines: (s, 2) int32, of a rod, and joints: (j, 2) int32, lines that follow each other. notes: what was left out of the file, or converted, a sentence each.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     tets: np.ndarray = field(default_factory=_no_tets)
     notes: list[str] = field(default_factory=list)
+    lines: np.ndarray = field(default_factory=_no_lines)
+    joints: np.ndarray = field(default_factory=_no_lines)
+
+    @staticmethod
+    def of_lines(vertices: np.ndarray, lines: np.ndarray, notes: list[str] | None = None) -> "Mesh":
+        """Lines (s, 2) alone."""
+        none = np.zeros((0, 3), dtype=np.int32)
+        return Mesh(np.asarray(vertices, dtype=np.float64), none, notes=notes or [], lines=np.asarray(lines, dtype=np.int32))
 
     def surface(self) -> "Mesh":
         """The triangles alone, with only the vertices that they use."""
@@ -117,9 +129,12 @@ def without_useless(mesh: Mesh, where: str, frames: Iterable[np.ndarray] = ()) -
 
 
 def center_of_mass(mesh: Mesh) -> np.ndarray:
-    """Centroid of the tets, else of the triangles, of uniform density, m."""
-    elements = mesh.tets if len(mesh.tets) else mesh.triangles
-    weights = np.abs((tet_volumes if len(mesh.tets) else triangle_areas)(mesh.vertices, elements))
+    """Centroid of the tets, else of the triangles, else of the lines, of uniform density, m."""
+    if len(mesh.lines):
+        elements, weights = mesh.lines, longest_edges(mesh.vertices, mesh.lines)
+    else:
+        elements = mesh.tets if len(mesh.tets) else mesh.triangles
+        weights = np.abs((tet_volumes if len(mesh.tets) else triangle_areas)(mesh.vertices, elements))
     centers = mesh.vertices[elements].mean(axis=1)
     return np.average(centers, axis=0, weights=weights) if weights.sum() > 0 else centers.mean(axis=0)
 
@@ -142,6 +157,38 @@ def read(name: str | Path, worker: Worker | None = None) -> Mesh:
     """
     path = locate(str(name))
     return guarded(path, lambda: from_contents(contents(path, worker), f'mesh file "{path}"'))
+
+
+def read_lines(name: str | Path, worker: Worker | None = None) -> Mesh:
+    """Reads the lines of a mesh file, for a rod: `l` of OBJ, L of .npz, cells of lines. Raises SceneError as `read` does."""
+    path = locate(str(name))
+
+    def lines() -> Mesh:
+        found = contents(path, worker)
+        cells = [rows[:, :2] for kind, rows in found.cells if kind == "line" and rows.ndim == 2 and rows.shape[1] >= 2]
+        where = f'mesh file "{path}"'
+        if not sum(map(len, cells)):
+            raise SceneError(f"{where}: holds no lines; a rod needs lines between its vertices, such as l of an OBJ file")
+        notes, rows = list(found.notes), np.concatenate(cells)
+        if len(found.polygons[1]) or any(kind not in ("line", "vertex") and len(other) for kind, other in found.cells):
+            notes.append("its faces and cells were left out: a rod takes the lines alone")
+        points = np.asarray(found.points, dtype=np.float64)
+        if points.ndim == 2 and points.shape[1] < 3:
+            points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        return replace(lines_from_arrays(points, rows, where), notes=notes)
+
+    return guarded(path, lines)
+
+
+def lines_from_arrays(vertices: np.ndarray, lines: np.ndarray, where: str, drop_unused: bool = True) -> Mesh:
+    """A rod's mesh from V (n, 3) and L (s, 2). Raises SceneError for indices out of range, and where there are no lines."""
+    if not len(lines):
+        raise SceneError(f"{where}: holds no lines; a rod needs at least one")
+    check_indices(lines, len(vertices), "lines", where)
+    if not drop_unused:
+        return Mesh.of_lines(vertices, lines)
+    used, lines = np.unique(lines, return_inverse=True)
+    return Mesh.of_lines(vertices[used.astype(np.int64)], lines.reshape(-1, 2))
 
 
 def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> Contents:

@@ -16,7 +16,16 @@ from pdipc.scene.meshes import TET_SUFFIXES, TRIANGLE_SUFFIXES
 SECTIONS = {
     "The scene": (schema.Scene,),
     "Simulation and contact": (schema.Simulation, schema.Contact),
-    "Bodies": (schema.Solid, schema.SolidMaterial, schema.Cloth, schema.ClothMaterial, garments.Inside, schema.Copies),
+    "Bodies": (
+        schema.Solid,
+        schema.SolidMaterial,
+        schema.Cloth,
+        schema.ClothMaterial,
+        garments.Inside,
+        schema.Rod,
+        schema.RodMaterial,
+        schema.Copies,
+    ),
     "Pins, selections, attachments, stitches": (schema.Pin, schema.Selection, schema.Attachment, schema.Stitch),
     "Obstacles and motions": (schema.Obstacle, schema.Motion, schema.Keyframe, schema.Deformation, schema.FrameArrays),
     "Forces": (schema.Wind, schema.VertexForce),
@@ -47,10 +56,11 @@ mesh = {{ shape = "sphere", radius = 0.3, cells = 12 }}
 
 A mesh is one of
 - a file, relative to the scene file: tets from {" ".join(TET_SUFFIXES)}, triangles from {" ".join(TRIANGLE_SUFFIXES)},
-  `.npz` with V and T or F, and USD (with the extra "usd"); `warp:bear.usd` is the file of that name among Warp's own assets;
+  lines from .obj, `.npz` with V and T, F or L, and USD (with the extra "usd"); `warp:bear.usd` is the file of that name among Warp's own assets;
 - a shape, such as `{{ shape = "box", size = [1, 1, 1], cells = [4, 4, 4] }}`;
 - arrays, `{{ vertices = [...], tets = [...] }}`: in Python, NumPy arrays.
 
+A rod takes the lines between vertices: `l` of an OBJ file, L of `.npz`, `lines` of arrays, and the shapes `rope`, `ring`, `coil` and `knot`.
 A solid takes a mesh's tets; cloth and obstacles take its triangles, which for a mesh of tets are its surface. A closed obstacle
 whose triangles face outward is solid, so nothing may start inside it; one that faces inward is a container. Bodies must be
 manifolds; obstacles need not be, and lose triangles without area or that repeat others.

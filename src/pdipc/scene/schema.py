@@ -214,6 +214,7 @@ def _rows_schema(kind: str, width: int) -> WithJsonSchema:
 _AS_LIST = PlainSerializer(lambda array: array.tolist(), return_type=list)
 Points = Annotated[np.ndarray, _rows(np.float64, 3), _AS_LIST, _rows_schema("number", 3)]
 Triangles = Annotated[np.ndarray, _rows(np.int64, 3), _AS_LIST, _rows_schema("integer", 3)]
+Lines = Annotated[np.ndarray, _rows(np.int64, 2), _AS_LIST, _rows_schema("integer", 2)]
 Tets = Annotated[np.ndarray, _rows(np.int64, 4), _AS_LIST, _rows_schema("integer", 4)]
 
 
@@ -238,19 +239,20 @@ def _frames(value: Any) -> np.ndarray:
 
 
 class Arrays(Table):
-    """A mesh given by its numbers: tets for a solid, triangles for cloth and obstacles."""
+    """A mesh given by its numbers: tets for a solid, triangles for cloth and obstacles, lines for a rod."""
 
     vertices: Points = Field(description="V (n, 3): rest positions, m.")
     tets: Tets | None = Field(default=None, description="T (t, 4): indices into vertices.")
     triangles: Triangles | None = Field(
         default=None, description="F (m, 3): indices into vertices; a solid's follow from its tets."
     )
+    lines: Lines | None = Field(default=None, description="L (s, 2): indices into vertices, the segments of a rod.")
     start: Points | None = Field(default=None, description="(n, 3): positions at the start where these differ from rest, m.")
 
     @model_validator(mode="after")
     def _check(self) -> "Arrays":
-        if self.tets is None and self.triangles is None:
-            raise ValueError("tets or triangles are needed")
+        if self.tets is None and self.triangles is None and self.lines is None:
+            raise ValueError("tets, triangles or lines are needed")
         if self.start is not None and self.start.shape != self.vertices.shape:
             raise ValueError(f"start has the shape {self.start.shape}; it must be that of vertices, {self.vertices.shape}")
         return self
@@ -293,13 +295,17 @@ MeshSource = Annotated[
     | Annotated[generators.Bowl, Tag("bowl")]
     | Annotated[generators.Stairs, Tag("stairs")]
     | Annotated[generators.Grid, Tag("grid")]
-    | Annotated[generators.Plane, Tag("plane")],
+    | Annotated[generators.Plane, Tag("plane")]
+    | Annotated[generators.Rope, Tag("rope")]
+    | Annotated[generators.Ring, Tag("ring")]
+    | Annotated[generators.Coil, Tag("coil")]
+    | Annotated[generators.Knot, Tag("knot")],
     Discriminator(
         _mesh_kind,
         custom_error_type="mesh",
         custom_error_message="must be a file path, a table with shape = "
         + ", ".join(f'"{name}"' for name in SHAPE_NAMES)
-        + ", or a table with vertices and tets or triangles",
+        + ", or a table with vertices and tets, triangles or lines",
     ),
 ]
 
@@ -393,6 +399,47 @@ class ClothMaterial(Table):
             bend = stretch * self.thickness**2 / (12 * (1 - self.poisson_ratio**2))
         object.__setattr__(self, "membrane_stiffness", stretch)
         object.__setattr__(self, "bending_stiffness", bend)
+        return self
+
+
+class RodMaterial(Table):
+    """A round, thin body that stretches, bends and twists: Young's modulus and radius give the three stiffnesses that are left open."""
+
+    density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
+    radius: Positive = Field(default=5e-3, le=1e3, description="Radius of the cross section, m: also its thickness in contact.")
+    young_modulus: Positive = Field(default=1e6, le=1e12, description="Young's modulus E, Pa.")
+    poisson_ratio: Real = Field(default=0.3, ge=0, le=0.5, description="Poisson's ratio nu.")
+    stretch_stiffness: Positive | None = Field(
+        default=None, le=1e12, description="E A, N: force per strain; absent: E pi radius^2."
+    )
+    bending_stiffness: NotNegative | None = Field(
+        default=None, le=1e12, description="E I, N m^2: moment per curvature; absent: E pi radius^4 / 4."
+    )
+    twist_stiffness: NotNegative | None = Field(
+        default=None,
+        le=1e12,
+        description="G J, N m^2: torque per twist; absent: E pi radius^4 / 4 / (1 + nu), or 0 where bending_stiffness is 0. 0: it "
+        "twists freely, as chains do, which is faster; any other value needs the Newton solver.",
+    )
+
+    @model_validator(mode="after")
+    def _fill(self) -> "RodMaterial":
+        """Completes the stiffnesses, so that readers find numbers; what was given stays known in `model_fields_set`."""
+        area = np.pi * self.radius**2
+        stretch, bend, twist = (
+            getattr(self, name) if name in self.model_fields_set else None
+            for name in ("stretch_stiffness", "bending_stiffness", "twist_stiffness")
+        )
+        bent = self.young_modulus * area * self.radius**2 / 4.0 if bend is None else bend
+        if twist and not bent:
+            raise ValueError(
+                f"twist_stiffness = {twist} N m^2 without bending_stiffness: what is to twist must resist bending, too"
+            )
+        object.__setattr__(self, "stretch_stiffness", self.young_modulus * area if stretch is None else stretch)
+        object.__setattr__(self, "bending_stiffness", bent)
+        if twist is None:
+            twist = self.young_modulus * area * self.radius**2 / 4.0 / (1.0 + self.poisson_ratio) if bent else 0.0
+        object.__setattr__(self, "twist_stiffness", twist)
         return self
 
 
@@ -551,7 +598,7 @@ class Copies(Table):
 
 
 class Body(Placed):
-    """What solids and cloth share."""
+    """What solids, cloth and rods share."""
 
     velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, m/s.")
     angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, about the centre of mass, rad/s.")
@@ -576,6 +623,17 @@ class Cloth(Body):
     material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
     inside: Inside | None = Field(
         default=None, description="What each closed part of it holds: a pressure, a gas or a liquid; needs the Newton solver."
+    )
+
+
+class Rod(Body):
+    """A rope, cable, hair or ring: lines that stretch, bend and twist, as thick as their radius."""
+
+    kind: Literal["rod"] = "rod"
+    material: RodMaterial = Field(default_factory=RodMaterial, description="What it is made of.")
+    minimum_separation: Positive | None = Field(
+        default=None,
+        description="Gap kept between the center lines of copies of this body, m; two bodies keep the mean. Absent: twice the radius.",
     )
 
 
@@ -685,7 +743,9 @@ class Scene(Table):
     description: str = Field(default="", description="What it shows.")
     simulation: Simulation = Field(default_factory=Simulation, description="How time advances.")
     contact: Contact = Field(default_factory=Contact, description="How surfaces keep apart.")
-    bodies: list[Annotated[Solid | Cloth, Field(discriminator="kind")]] = Field(min_length=1, description="What is simulated.")
+    bodies: list[Annotated[Solid | Cloth | Rod, Field(discriminator="kind")]] = Field(
+        min_length=1, description="What is simulated."
+    )
     obstacles: list[Obstacle] = Field(default=[], description="Rigid surfaces, static or scripted.")
     attachments: list[Attachment] = Field(default=[], description="Springs between bodies.")
     stitches: list[Stitch] = Field(default=[], description="Threads that sew cloth.")

@@ -19,6 +19,7 @@ from scipy.sparse.linalg import cg
 
 from pdipc import constraints
 from pdipc.model import elasticity
+from pdipc.output.skins import skin
 from pdipc.simulation import Simulation, stats_of
 from pdipc.viewer.guard import EVERYWHERE, Guard
 
@@ -39,7 +40,8 @@ GRIP, HELD = 0.2, 8  # radius of what is held, of the body's size, and least num
 class View:
     """The surfaces of all bodies on a web page, one mesh a body.
 
-    triangles: (m, 3); body_of_vertex: (n,); kinds: "solid", "cloth" or "obstacle" a body; positions: (n, 3), m.
+    triangles: (m, 3); body_of_vertex: (n,); kinds: "solid", "cloth", "rod" or "obstacle" a body, radii: (bodies,) m, of rods;
+    positions: (n, 3), m.
     The page is served at `url` as long as the object lives, to whoever knows that address, which has a token in it (`guard`); if the
     port is taken, the next free one is used. origins: pages elsewhere that may connect too.
     Raises OSError for a host that this machine cannot serve at, ValueError for an origin that is none.
@@ -50,6 +52,7 @@ class View:
         triangles: np.ndarray,
         body_of_vertex: np.ndarray,
         kinds: list[str],
+        radii: np.ndarray,
         positions: np.ndarray,
         host: str,
         port: int,
@@ -65,16 +68,16 @@ class View:
         self.url = f"http://{shown}:{self.server.get_port()}/{guard.token}/"
         self.server.scene.set_up_direction("+y")
         self._aim(positions[np.isin(body_of_vertex, [i for i, kind in enumerate(kinds) if kind != "obstacle"])])
-        self.meshes, self.vertices = [], []
+        self.meshes, self.skins = [], []
         of_triangle = body_of_vertex[triangles[:, 0]]
         for body, kind in enumerate(kinds):
-            vertices, local = np.unique(triangles[of_triangle == body], return_inverse=True)
-            self.vertices.append(vertices)
+            drawn = skin(triangles[of_triangle == body], float(radii[body]))
+            self.skins.append(drawn)
             self.meshes.append(
                 self.server.scene.add_mesh_simple(
                     f"/body{body}",
-                    positions[vertices].astype(np.float32),
-                    local.reshape(-1, 3),
+                    drawn.points(positions).astype(np.float32),
+                    drawn.triangles,
                     color=GREY if kind == "obstacle" else PALETTE[body % len(PALETTE)],
                     side="double",
                 )
@@ -89,8 +92,8 @@ class View:
     def show(self, positions: np.ndarray) -> None:
         """Moves all bodies to positions (n, 3), m; only the vertices of bodies that moved are sent."""
         with self.server.atomic():
-            for mesh, vertices in zip(self.meshes, self.vertices, strict=True):
-                mesh.vertices = positions[vertices].astype(np.float32)
+            for mesh, drawn in zip(self.meshes, self.skins, strict=True):
+                mesh.vertices = drawn.points(positions).astype(np.float32)
 
 
 def _must_be_here(host: str) -> None:
@@ -110,7 +113,7 @@ class Playback:
         first = run.positions(0)
         self.run, self.times, self.stats = run, np.asarray(run.times), run.stats
         of_vertex = np.asarray(run.topology["body_of_vertex"])
-        self.view = View(run.triangles, of_vertex, list(run.body_kinds), first, host, port, origins)
+        self.view = View(run.triangles, of_vertex, list(run.body_kinds), run.topology["body_radii"], first, host, port, origins)
         gui = self.view.server.gui
         last = run.frame_count - 1
         self.frame = gui.add_slider("frame", min=0, max=max(1, last), step=1, initial_value=0, disabled=last == 0)
@@ -202,7 +205,8 @@ class Live:
         self.assembly = assembly = self.simulation.model.assembly
         kinds = [body.kind for body in assembly.bodies]
         triangles, positions = self.simulation.triangles, self.simulation.positions
-        self.view = View(triangles, assembly.body_of_vertex, kinds, positions, host, port, origins)
+        radii = assembly.topology()["body_radii"]
+        self.view = View(triangles, assembly.body_of_vertex, kinds, radii, positions, host, port, origins)
         gui = self.view.server.gui
         self.running = gui.add_checkbox("run", initial_value=True)
         self.report = gui.add_markdown(_told(0.0, {}))

@@ -1,5 +1,6 @@
 """NumPy archives, and the formats of surfaces: Wavefront OBJ, OFF, STL and PLY."""
 
+import itertools
 import re
 import struct
 import zipfile
@@ -18,8 +19,8 @@ def npz(path: Path) -> Contents:
         raise Damaged(f"it would unpack to {size / 2**30:.3g} GiB")
     with np.load(path) as data:
         if "V" not in data:
-            raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets) or F (triangles)')
-        cells = [(kind, data[name]) for kind, name in (("tetra", "T"), ("triangle", "F")) if name in data]
+            raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets), F (triangles) or L (lines)')
+        cells = [(kind, data[name]) for kind, name in (("tetra", "T"), ("triangle", "F"), ("line", "L")) if name in data]
         vertices = data["V"]
         if vertices.ndim != 3 or not len(vertices):
             return Contents(vertices, cells)
@@ -28,7 +29,14 @@ def npz(path: Path) -> Contents:
 
 def obj(path: Path) -> Contents:
     """Wavefront OBJ: v, f and l; indices count from 1, or back from the last vertex so far."""
-    points, corners, counts, lines, others = [], [], [], 0, set()
+    points, corners, counts, lines, others = [], [], [], [], set()
+
+    def index(value: str, number: int) -> int:
+        found = int(value.partition("/")[0])
+        if found == 0 or found < -len(points):
+            raise Damaged(f"line {number} names vertex {found}; vertices count from 1, or back from -1")
+        return found - 1 if found > 0 else len(points) + found
+
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         key, *values = line.partition("#")[0].split() or [""]
@@ -41,17 +49,14 @@ def obj(path: Path) -> Contents:
                 raise Damaged(f"line {number} has a face of {len(values)} vertices; needed: at least 3")
             counts.append(len(values))
             for value in values:
-                index = int(value.partition("/")[0])
-                if index == 0 or index < -len(points):
-                    raise Damaged(f"line {number} names vertex {index}; vertices count from 1, or back from -1")
-                corners.append(index - 1 if index > 0 else len(points) + index)
+                corners.append(index(value, number))
         elif key == "l":
-            lines += max(0, len(values) - 1)
+            chain = [index(value, number) for value in values]
+            lines += itertools.pairwise(chain)
         elif key in ("p", "curv", "curv2", "surf"):
             others.add(key)
-    found = Contents(floats(points, 3), polygons=(np.array(corners, dtype=np.int64), np.array(counts, dtype=np.int64)))
-    if lines:
-        found.notes.append(lines_left_out(lines))
+    cells = [("line", np.array(lines, dtype=np.int64))] if lines else []
+    found = Contents(floats(points, 3), cells, (np.array(corners, dtype=np.int64), np.array(counts, dtype=np.int64)))
     if others:
         found.notes.append(f"elements other than faces were left out: {', '.join(sorted(others))}")
     return found
