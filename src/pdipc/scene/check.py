@@ -71,7 +71,7 @@ def check_placed(assembly: Assembly, positions: np.ndarray, precision: str, body
     assembly = replace(assembly, positions=positions)
     label = _label(assembly.bodies[body])
     touching, found = _intersections(assembly, precision)
-    found = [*found, *_too_close(assembly, touching, precision), *_inside(assembly, touching)]
+    found = [*found, *too_close(assembly, touching, precision), *_inside(assembly, touching)]
     return [finding for finding in found if label in finding.where.split(" and ") or label in finding.found]
 
 
