@@ -7,11 +7,11 @@ import warp as wp
 
 from pdipc import algorithm
 from pdipc.device.launch import one_at_a_time
-from pdipc.forces import ContactForces
 from pdipc.integration.inertia import CHORDS, FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
 from pdipc.model import Model, State
 from pdipc.nonlinear import status
+from pdipc.output.forces import ContactForces
 from pdipc.work import Work
 
 RESTRUCTURE_EVERY = 32  # steps between rebuilds of the culling's trees

@@ -1,6 +1,7 @@
 """The model: what stays constant during a simulation, assembled once from a scene; and the state that a step changes."""
 
 import functools
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +31,9 @@ from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
+from pdipc.scene.errors import SceneWarning
 from pdipc.scene.schema import ClothMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
+from pdipc.scene.separate import moved_note
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -212,6 +215,8 @@ def build(scene: Scene, device: str | None = None) -> Model:
     place = Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
     refuse(scene, assembly, number.name)
+    for name, far in (assembly.separated or {}).items():
+        warnings.warn(moved_note(name, far), SceneWarning, stacklevel=2)
     h = sim.time_step / sim.substeps
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)

@@ -191,6 +191,8 @@ def run_scene(
         topology = {"triangles": model.triangles, **model.assembly.topology()}
         dropped = 0.0 if model.solver is None else model.solver.dropped
         meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
+        if model.assembly.separated:
+            meta["moved_at_the_start"] = model.assembly.separated
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
     with writer:
         _run(simulation, writer, steps, certify, forces, progress)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pdipc
-from pdipc.forces import ContactForces
+from pdipc.output.forces import ContactForces
 
 from .scenes import floor, scene, solid
 

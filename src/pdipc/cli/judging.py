@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pdipc.audit import Audit
-    from pdipc.forces import ContactForces
+    from pdipc.output.forces import ContactForces
     from pdipc.output.results import Run
 
 LISTED = 20  # intersecting pairs that `check` prints of a frame
@@ -157,7 +157,7 @@ def _write_forces(path: Path, opened: "Run", taken: range) -> None:
     import numpy as np
 
     from pdipc.audit import vertex_forces
-    from pdipc.forces import pressures
+    from pdipc.output.forces import pressures
 
     found = [
         (*both, pressures(both[0], opened.positions(frame), opened.triangles))

@@ -2,11 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pdipc.cli.app import SceneArgument, command, fail, outside_of_runs, scene_file
+from pdipc.cli.app import SceneArgument, command, fail, load, outside_of_runs, scene_file
+
+if TYPE_CHECKING:
+    from pdipc.scene.finding import Finding
 
 
 @command()
@@ -24,18 +27,66 @@ def scenes(plain: Annotated[bool, typer.Option("--plain", help="Names only, one 
 
 
 @command("check-scene")
-def check_scene(scene: SceneArgument) -> None:
+def check_scene(
+    scene: SceneArgument,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the start, with what intersects in red: .png.")
+    ] = None,
+    repair: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Separate what intersects at the start, and write the scene with it: .toml."),
+    ] = None,
+) -> None:
     """List everything that keeps a scene from being simulated; exit code 2 if something cannot be read, else 1 if there is anything."""
     from pdipc.scene.check import check_file
 
+    for option, path, suffix in (("--picture", picture, ".png"), ("--repair", repair, ".toml")):
+        if path is not None and path.suffix != suffix:
+            raise typer.BadParameter(f'"{path}"; it must end in {suffix}', param_hint=option)
+        outside_of_runs(path, option)
+    if picture is not None:
+        _draw_start(scene, picture)
+    if repair is not None:
+        _repair(scene, repair)
+        return
     findings, notes = check_file(scene_file(scene))
     for note in notes:
         typer.echo(f"note: {note}")
+    _tell(scene, findings)
+    typer.echo(f"{scene}: can be simulated")
+
+
+def _tell(scene: str, findings: "list[Finding]") -> None:
+    """Prints the findings, and ends the command where there are any."""
     for finding in findings:
         typer.echo(f"- {finding}")
     if findings:
         fail(f"{scene}: {len(findings)} to put right", 1 if all(finding.readable for finding in findings) else 2)
-    typer.echo(f"{scene}: can be simulated")
+
+
+def _draw_start(scene: str, picture: Path) -> None:
+    from pdipc.output.starts import draw_start
+    from pdipc.scene.assembly import assemble
+    from pdipc.scene.check import prepare
+
+    loaded = load(scene)
+    assembly = assemble(loaded)
+    prepare(loaded, assembly, "float32" if loaded.simulation.precision == "float32" else "float64")
+    pairs = draw_start(assembly, picture)
+    typer.echo(f"{picture}: {pairs} pairs of triangles intersect at the start")
+
+
+def _repair(scene: str, out: Path) -> None:
+    from pdipc.scene.repair import repaired
+
+    loaded = load(scene)
+    made, moved, findings = repaired(loaded, "float32" if loaded.simulation.precision == "float32" else "float64")
+    for note in moved:
+        typer.echo(f"note: {note}")
+    _tell(scene, findings)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    made.save(out)
+    typer.echo(f"{out}: can be simulated" + ("" if moved else "; nothing had to be moved"))
 
 
 @command()

@@ -8,7 +8,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from pdipc.audit import Audit
-    from pdipc.forces import ContactForces
+    from pdipc.output.forces import ContactForces
 
 
 def plot_audits(

@@ -69,7 +69,7 @@ class Field:
 def pressure(run: Run, frames: list[int], top: float | None = None, progress: Callable[[int], None] | None = None) -> Field:
     """Contact pressure on the given frames, Pa. top: of the last colour; what one in a hundred loaded vertices exceeds where None."""
     from pdipc.audit import vertex_forces
-    from pdipc.forces import pressures
+    from pdipc.output.forces import pressures
 
     found = {}
     for frame, (normal, _) in zip(frames, vertex_forces(run, frames), strict=True):

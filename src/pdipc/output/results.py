@@ -6,7 +6,7 @@
     frames/         000000.npy, ...: positions (n, 3) of each step, m
     stats.jsonl     a line per frame: step, time, statistics of the step
     run.vtkhdf      the same frames for ParaView, up to the last checkpoint
-    forces/         000001.npz, ...: forces of contact in each step, see `pdipc.forces.ContactForces`
+    forces/         000001.npz, ...: forces of contact in each step, see `pdipc.output.forces.ContactForces`
     checkpoints/    the last two states, bit for bit
     segments/       with --certify: the ends of every committed motion
     run.lock        who is writing, while somebody is: see `lock`
@@ -32,8 +32,8 @@ from typing import Any
 
 import numpy as np
 
-from pdipc.forces import ContactForces
 from pdipc.output import lock
+from pdipc.output.forces import ContactForces
 from pdipc.output.skins import Skin, skin
 
 FORMAT = 1

@@ -173,6 +173,7 @@ class Assembly:
     activation_distance: d_hat, m; 1e-3 of the largest body unless the scene says otherwise.
     minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
     notes: what was left out of files, or converted, a line each.
+    separated: where the start was separated, how far the farthest vertex of each body that was moved went, m, by name; see `pdipc.scene.separate`.
     """
 
     positions: np.ndarray
@@ -190,6 +191,7 @@ class Assembly:
     winds: list[AssembledWind] = field(default_factory=list)
     forces: list[AssembledForce] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    separated: dict[str, float] | None = None
 
     @property
     def triangles(self) -> np.ndarray:

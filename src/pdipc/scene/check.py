@@ -19,6 +19,7 @@ from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import MOST, most_chords, movers_of
 from pdipc.scene.schema import Cloth, Rod, Scene, local_global_settings, uses_newton
+from pdipc.scene.separate import separate
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -62,7 +63,7 @@ def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[
         return findings, []
     precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
     complete = not (problems or part.problems)
-    fit_defaults(scene, assembly, precision)
+    prepare(scene, assembly, precision)
     return [*findings, *_turns(scene, assembly), *_check(assembly, precision, complete)], assembly.notes
 
 
@@ -82,11 +83,20 @@ def _unreadable(problem: str) -> Finding:
 
 def refuse(scene: Scene, assembly: Assembly, precision: str) -> None:
     """Raises SceneError with all findings of `check` where there are any; assembly: that of `scene`, whose defaults are fitted first."""
-    fit_defaults(scene, assembly, precision)
+    prepare(scene, assembly, precision)
     findings = [*_settings(scene), *_turns(scene, assembly), *check(assembly, precision)]
     if findings:
         found = "1 thing" if len(findings) == 1 else f"{len(findings)} things"
         raise SceneError("\n  ".join([f"the scene cannot be simulated, {found} to put right:", *map(str, findings)]))
+
+
+def prepare(scene: Scene, assembly: Assembly, precision: str) -> None:
+    """Completes the assembly of `scene` for `precision`: distances that are left open, and a start without intersections where it is asked for."""
+    fit_defaults(scene, assembly, precision)
+    if scene.contact.start == "separate" and not any(next(_numbers(assembly, body), None) for body in assembly.bodies):
+        done = separate(assembly, scene.contact.start_limit)
+        assembly.positions, assembly.separated = done.positions, done.moved
+        assembly.notes += done.notes()
 
 
 def fit_defaults(scene: Scene, assembly: Assembly, precision: str) -> None:
@@ -391,15 +401,32 @@ def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, i
     pairs = find_intersections(assembly.positions, triangles, assembly.obstacle)
     owners = np.sort(assembly.body_of_vertex[triangles[pairs][:, :, 0]], axis=1)
     findings, touching = [], set()
+    tried = assembly.separated is not None
     for i, j in np.unique(owners, axis=0):
         own = pairs[np.all(owners == (i, j), axis=1)]
-        place = assembly.positions[triangles[own[0]]].mean(axis=(0, 1))
+        corners = assembly.positions[triangles[own[0]]]
         where = _label(assembly.bodies[i]) + (f" and {_label(assembly.bodies[j])}" if i != j else "")
         what = "segments and triangles" if "rod" in (assembly.bodies[i].kind, assembly.bodies[j].kind) else "triangles"
-        found = f"{len(own)} pairs of {what} intersect at the start, one near {_at(place)} m, in {precision} coordinates"
-        findings.append(Finding(where, found, "move them apart" if i != j else "the surface must not pass through itself"))
+        found = f"{len(own)} pairs of {what} intersect at the start, one near {_at(_shared_point(corners))} m, in {precision} coordinates"
+        numbers = ", ".join(f"{a} and {b}" for a, b in _within_bodies(assembly, own[:LISTED]))
+        found += f" ({what} {numbers}{', ...' if len(own) > LISTED else ''})"
+        right = "move them apart" if i != j else "the surface must not pass through itself"
+        right += "; raising contact.start_limit may help" if tried else ', or take contact.start = "separate"'
+        findings.append(Finding(where, found, right))
         touching.add((int(i), int(j)))
     return touching, findings
+
+
+def _shared_point(corners: np.ndarray) -> np.ndarray:
+    """(3,) about where two triangles (2, 3, 3) meet: the middle of what their boxes share."""
+    low, high = corners.min(axis=1).max(axis=0), corners.max(axis=1).min(axis=0)
+    return 0.5 * (low + high)
+
+
+def _within_bodies(assembly: Assembly, triangles: np.ndarray) -> np.ndarray:
+    """Numbers (k, 2) of triangles, counted within the body of each."""
+    firsts = np.cumsum([0] + [len(body.triangles) for body in assembly.bodies])
+    return triangles - firsts[assembly.body_of_vertex[assembly.triangles[triangles][:, :, 0]]]
 
 
 def too_close(assembly: Assembly, touching: set[tuple[int, int]], precision: str) -> Iterator[Finding]:

@@ -168,6 +168,21 @@ class Contact(Table):
         description="Part of the speed of approach that surfaces part with after an impact (eps of Eq. 6). Absent: what the barrier "
         "gives back, 0 to 0.1 for most impacts and steps; with the paper's method 0.",
     )
+    start: Literal["as_given", "separate"] = Field(
+        default="as_given",
+        description='Surfaces that intersect, or are too near, at the start: "as_given" refuses them; "separate" moves bodies apart first, as little '
+        "as it finds, and says how far (docs/starts.md).",
+    )
+    start_limit: Positive | None = Field(
+        default=None,
+        description='How far "separate" may move a vertex, m; absent: a tenth of the largest body\'s size.',
+    )
+
+    @model_validator(mode="after")
+    def _check_start(self) -> "Contact":
+        if self.start_limit is not None and self.start != "separate":
+            raise ValueError('start_limit has no effect unless start = "separate"')
+        return self
 
 
 # --- meshes and where they stand ---

@@ -1,10 +1,11 @@
 """Separates surfaces that intersect, or are too near, at the start: bounded displacements, before anything is simulated.
 
-Which side is the right one? An edge that crosses a surface cuts the mesh graph of its own. Where the surface that is crossed encloses space, the parts that lie
-inside are on the wrong side (generalized winding number, Jacobson et al. 2013: it may have holes). Where it is open, as cloth is, the largest part is on the right
-side and all others are not (global intersection analysis, Baraff et al. 2003). An edge that cuts nothing off has its nearer end on the wrong side.
-A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as it may: obstacles and what pins hold
-exactly do not, solids as a whole first, each other vertex by itself, and displacements spread to its neighbours so that elements are strained little.
+Which side is the right one? An edge that crosses a surface cuts the mesh graph of its own. Where the surface that is crossed encloses space, the parts
+that lie inside are on the wrong side (generalized winding number, Jacobson et al. 2013: it may have holes). Where it is open, as cloth is, the largest
+part is on the right side and all others are not (global intersection analysis, Baraff et al. 2003). An edge that cuts nothing off has its nearer end on
+the wrong side. A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as
+it may: obstacles and what pins hold exactly do not, solids as a whole first, each other vertex by itself, and displacements spread to its neighbours so
+that elements are strained little.
 
 Nothing here is trusted: the exact witness says when it is done.
 """
@@ -48,10 +49,12 @@ class Separation:
 
     def notes(self) -> list[str]:
         """A line for each body that was moved."""
-        return [
-            f'body "{name}": moved by up to {far:.3g} m, so that nothing intersects or is too near at the start'
-            for name, far in self.moved.items()
-        ]
+        return [moved_note(name, far) for name, far in self.moved.items()]
+
+
+def moved_note(name: str, far: float) -> str:
+    """That a body was moved at the start, and how far, m."""
+    return f'body "{name}": moved by up to {far:.3g} m, so that nothing intersects or is too near at the start'
 
 
 def separate(assembly: Assembly, limit: float | None = None) -> Separation:
@@ -69,7 +72,7 @@ class _Separator:
         self.x = assembly.positions.copy()
         self.triangles = assembly.triangles
         sides = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        self.edges = np.unique(sides, axis=0)
+        self.edges = np.unique(sides[sides[:, 0] != sides[:, 1]], axis=0)  # a rod's segment is a triangle (a, b, b)
         self.owner, self.obstacle, held = assembly.body_of_vertex, assembly.obstacle, assembly.scripted
         solid = np.array([body.kind == "solid" for body in assembly.bodies])
         self.weight = np.where(held, 0.0, np.where(solid[self.owner], SOLID_WEIGHT, 1.0))
@@ -151,9 +154,9 @@ class _Separator:
     def _wrong(self, a: int, b: int, crossings: np.ndarray) -> np.ndarray:
         """(n,) int: which part of body a each vertex belongs to that is on the wrong side of body b; -1 for all others."""
         body = self.assembly.bodies[a]
-        own = self.edges[(self.owner[self.edges[:, 0]] == a)]
-        cut = np.unique(crossings[:, 0])
-        kept = own[~np.isin(np.flatnonzero(self.owner[self.edges[:, 0]] == a), cut)] - body.first
+        of_body = np.flatnonzero(self.owner[self.edges[:, 0]] == a)
+        own, cut = self.edges[of_body], np.unique(crossings[:, 0])
+        kept = own[~np.isin(of_body, cut)] - body.first
         count = body.last - body.first
         graph = scipy.sparse.coo_matrix((np.ones(len(kept)), kept.T), shape=(count, count))
         _, label = connected_components(graph, directed=False)
@@ -164,8 +167,16 @@ class _Separator:
             inside = winding_numbers(self.x[first + body.first], self.x[other.triangles]) > 0.5
             wrong = ends[inside]
         else:
-            sizes = np.bincount(label[np.unique(body.triangles) - body.first], minlength=label.max() + 1)
-            wrong = ends[ends != np.argmax(sizes)]
+            surface = np.unique(body.triangles) - body.first
+            sizes = np.bincount(label[surface], minlength=label.max() + 1)
+            whole = scipy.sparse.coo_matrix((np.ones(len(own)), (own - body.first).T), shape=(count, count))
+            _, piece = connected_components(whole, directed=False)
+            piece_of = np.zeros(len(sizes), dtype=np.int64)
+            piece_of[label] = piece
+            largest = np.zeros(piece.max() + 1, dtype=np.int64)
+            order = np.argsort(sizes, kind="stable")
+            largest[piece_of[order]] = order  # the last one stays
+            wrong = ends[ends != largest[piece_of[ends]]]
         part = np.full(len(self.x), -1)
         chosen = np.isin(label, wrong) & np.isin(np.arange(count), np.unique(body.triangles) - body.first)
         part[np.flatnonzero(chosen) + body.first] = label[chosen]
@@ -262,7 +273,9 @@ class _Separator:
             gives = np.array([np.where(side == k, self.weight[quads], 0.0).max(axis=1) for k in (0, 1)])
             part = gives / np.maximum(gives.sum(axis=0), 1e-300)
             sign = np.where(side == 0, 1.0, -1.0)
-            whole = (sign * ways[:, None] * np.where(side == 0, part[0][:, None], part[1][:, None]))[:, :, None] * directions[:, None, :]
+            whole = (sign * ways[:, None] * np.where(side == 0, part[0][:, None], part[1][:, None]))[:, :, None] * directions[
+                :, None, :
+            ]
             own = np.where(as_whole[quads][:, :, None], whole, own)
         parts = np.abs(weights) * (self.weight[quads] > 0.0)
         count = np.bincount(quads.ravel(), parts.ravel(), minlength=n)
@@ -287,6 +300,8 @@ class _Separator:
 
 def _encloses(assembly: Assembly, body: AssembledBody) -> bool:
     """Whether a surface encloses space: it faces outward and hardly has a border."""
+    if body.kind == "rod":
+        return False
     sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, counts = np.unique(sides, axis=0, return_counts=True)
     corners = assembly.positions[body.triangles]
