@@ -205,14 +205,14 @@ class Model:
 
 
 @one_at_a_time
-def build(scene: Scene, device: str | None = None) -> Model:
+def build(scene: Scene, device: str | Device | None = None) -> Model:
     """Assembles a scene on a device: "cpu", "cuda:0", or None for the scene's choice, else CUDA where there is one.
 
     Raises SceneError for what `pdipc.check_scene` finds, before anything is launched.
     """
     assembly = assemble(scene)
     sim = scene.simulation
-    place = Device(device or sim.device)
+    place = device if isinstance(device, Device) else Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
     refuse(scene, assembly, number.name)
     for name, far in (assembly.separated or {}).items():

@@ -14,13 +14,13 @@ from pdipc.work import Work
 YES, NO = (wp.array([value], dtype=wp.int32, device="cpu") for value in (1, 0))
 
 
-def crowded(precision="float64"):
+def crowded(precision="float64", device="cpu"):
     """A block on the floor, turned so that it stretches, under a pinned sheet; all near enough to touch, with friction."""
     block = solid("block", (0.2, 0.2, 0.2), (3, 2, 2), at=(0, 0.104, 0), poisson=0.3, friction=0.3)
     pins = [{"select": {"nearest": [0.15, 0.21, 0.15]}}, {"select": {"nearest": [-0.15, 0.21, -0.15]}, "stiffness": 50.0}]
     sheet = cloth("sheet", [0.3, 0.3], [5, 5], at=(0, 0.21, 0), friction=0.3, pins=pins)
     contact = {"activation_distance": 1e-2}
-    return pdipc.build(scene([block, sheet], [floor(1.0, friction=0.3)], contact=contact, precision=precision), "cpu")
+    return pdipc.build(scene([block, sheet], [floor(1.0, friction=0.3)], contact=contact, precision=precision), device)
 
 
 def assembled(model, project):

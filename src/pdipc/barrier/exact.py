@@ -21,6 +21,7 @@ from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
+from pdipc.linear.wide_pcg import Operator
 
 
 @functools.cache
@@ -234,6 +235,77 @@ def kernels(real: Real) -> SimpleNamespace:
         diagonal_out[v] = d
         energy_out[v] = own
 
+    @wp.func
+    def feel(
+        k: int,
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        lever: wp.array(dtype=mat43),
+        hessian: wp.array(dtype=scalar),
+        bend: wp.array(dtype=scalar),
+        first_bent: wp.array(dtype=mat43),
+        second_bent: wp.array(dtype=mat43),
+        project: wp.array(dtype=wp.int32),
+    ):
+        """Of pair k under p: what its three directions feel, N, the part of a I, and p . (Hessian) p."""
+        q = quads[k]
+        p0 = p[q[0]]
+        p1 = p[q[1]]
+        p2 = p[q[2]]
+        p3 = p[q[3]]
+        j = lever[k]
+        along = wp.dot(row(j, 0), p0) + wp.dot(row(j, 1), p1) + wp.dot(row(j, 2), p2) + wp.dot(row(j, 3), p3)
+        response = vec3(hessian[k] * along, zero, zero)
+        across = vec3()
+        work = response[0] * along
+        if project[0] == 0 and bend[k] > zero:
+            c = bend[k]
+            a = weights[k]
+            u = a[0] * p0 + a[1] * p1 + a[2] * p2 + a[3] * p3
+            across = -c * (u - wp.dot(normals[k], u) * normals[k])
+            g = first_bent[k]
+            bent = wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+            response[1] = c * bent
+            work += wp.dot(across, u) + response[1] * bent
+            g = second_bent[k]
+            bent = wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
+            response[2] = c * bent
+            work += response[2] * bent
+        return response, across, work
+
+    @wp.func
+    def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        return low
+
+    @wp.func
+    def exert(
+        v: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        lever: wp.array(dtype=mat43),
+        first_bent: wp.array(dtype=mat43),
+        second_bent: wp.array(dtype=mat43),
+        project: wp.array(dtype=wp.int32),
+        response: wp.array(dtype=vec3),
+        across: wp.array(dtype=vec3),
+    ) -> vec3:
+        """What the pairs of vertex v make of what they feel."""
+        total = vec3()
+        for i in range(first_entry(v, ends), ends[v]):
+            k = entries[i] // 4
+            s = entries[i] % 4
+            total += response[k][0] * row(lever[k], s)
+            if project[0] == 0:
+                total += weights[k][s] * across[k]
+                total += response[k][1] * row(first_bent[k], s) + response[k][2] * row(second_bent[k], s)
+        return total
+
     @wp.kernel(module=module)
     def stretch(
         span: Span,
@@ -251,38 +323,19 @@ def kernels(real: Real) -> SimpleNamespace:
         response_out: wp.array(dtype=vec3),
         across_out: wp.array(dtype=vec3),
     ):
-        """Of each pair: what its three directions feel, N, and the part of a I."""
         worker = span.first + wp.tid()
         for b in range(worker * span.block, count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
-                p0 = p[q[0]]
-                p1 = p[q[1]]
-                p2 = p[q[2]]
-                p3 = p[q[3]]
-                j = lever[k]
-                along = wp.dot(row(j, 0), p0) + wp.dot(row(j, 1), p1) + wp.dot(row(j, 2), p2) + wp.dot(row(j, 3), p3)
-                response = vec3(hessian[k] * along, zero, zero)
-                across = vec3()
-                if project[0] == 0 and bend[k] > zero:
-                    c = bend[k]
-                    a = weights[k]
-                    u = a[0] * p0 + a[1] * p1 + a[2] * p2 + a[3] * p3
-                    across = -c * (u - wp.dot(normals[k], u) * normals[k])
-                    g = first_bent[k]
-                    response[1] = c * (
-                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
-                    )
-                    g = second_bent[k]
-                    response[2] = c * (
-                        wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
-                    )
+                response, across, _work = feel(
+                    k, p, quads, weights, normals, lever, hessian, bend, first_bent, second_bent, project
+                )
                 response_out[k] = response
                 across_out[k] = across
 
     @wp.kernel(module=module)
     def spread(
         first: int,
+        free: wp.array(dtype=scalar),
         ends: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
         weights: wp.array(dtype=vec4),
@@ -295,21 +348,21 @@ def kernels(real: Real) -> SimpleNamespace:
         y: wp.array(dtype=vec3),
     ):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        if ends[v] > low:
-            total = vec3()
-            for i in range(low, ends[v]):
-                k = entries[i] // 4
-                s = entries[i] % 4
-                total += response[k][0] * row(lever[k], s)
-                if project[0] == 0:
-                    total += weights[k][s] * across[k]
-                    total += response[k][1] * row(first_bent[k], s) + response[k][2] * row(second_bent[k], s)
-            y[v] = y[v] + total
+        if free[v] > zero and ends[v] > first_entry(v, ends):
+            y[v] = y[v] + exert(
+                v, ends, entries, weights, lever, first_bent, second_bent, project, response, across
+            )
 
-    return SimpleNamespace(differentiate=differentiate, gather=gather, stretch=stretch, spread=spread, mat43=mat43, row=row)
+    return SimpleNamespace(
+        differentiate=differentiate,
+        gather=gather,
+        stretch=stretch,
+        spread=spread,
+        mat43=mat43,
+        row=row,
+        feel=feel,
+        exert=exert,
+    )
 
 
 class BarrierTerm(ActivePairs):
@@ -358,18 +411,102 @@ class BarrierTerm(ActivePairs):
         return self.force_of_vertex
 
     def apply(self, p: wp.array, y: wp.array) -> None:
-        """y += (contact Hessian) p, pair by pair and gathered per vertex. Recordable."""
+        """y += (contact Hessian) p at free vertices, pair by pair and gathered per vertex. Recordable."""
         k, device = self.exact, self.device
         bent = [self.first_bent, self.second_bent, self.project]
         inputs = [self.count, p, self.quads, self.weights, self.normals, self.lever, self.hessian, self.bend, *bent]
         device.launch_list(k.stretch, self.capacity, [*inputs, self.felt, self.across])
-        inputs = [self.ends, self.entries, self.weights, self.lever, *bent, self.felt, self.across]
+        inputs = [self.free, self.ends, self.entries, self.weights, self.lever, *bent, self.felt, self.across]
         device.launch(k.spread, len(self.ends), [*inputs, y])
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
         inputs = [self.ends, self.entries, self.quads, self.lever, self.hessian]
-        self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+        if self.device.wide:
+            modes.couple(wide_coupling(self.real), inputs)
+        else:
+            self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+
+    def operand(self):
+        """What the functions of `operator` work on."""
+        o = operator(self.real).Operand()
+        for name in ("count", "quads", "weights", "normals", "lever", "hessian", "bend", "first_bent", "second_bent"):
+            setattr(o, name, getattr(self, name))
+        o.project, o.ends, o.entries, o.response, o.across = self.project, self.ends, self.entries, self.felt, self.across
+        return o
+
+
+@functools.cache
+def operator(real: Real) -> Operator:
+    """The Hessian for the kernels of `wide_pcg`."""
+    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    k_of = kernels(real)
+    mat43, feel_pair, exert_pairs = k_of.mat43, k_of.feel, k_of.exert
+
+    @wp.struct
+    class Operand:
+        count: wp.array(dtype=wp.int32)
+        quads: wp.array(dtype=wp.vec4i)
+        weights: wp.array(dtype=vec4)
+        normals: wp.array(dtype=vec3)
+        lever: wp.array(dtype=mat43)
+        hessian: wp.array(dtype=scalar)
+        bend: wp.array(dtype=scalar)
+        first_bent: wp.array(dtype=mat43)
+        second_bent: wp.array(dtype=mat43)
+        project: wp.array(dtype=wp.int32)
+        ends: wp.array(dtype=wp.int32)
+        entries: wp.array(dtype=wp.int32)
+        response: wp.array(dtype=vec3)
+        across: wp.array(dtype=vec3)
+
+    @wp.func
+    def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
+        response, across, work = feel_pair(
+            k,
+            p,
+            o.quads,
+            o.weights,
+            o.normals,
+            o.lever,
+            o.hessian,
+            o.bend,
+            o.first_bent,
+            o.second_bent,
+            o.project,
+        )
+        o.response[k] = response
+        o.across[k] = across
+        return work
+
+    @wp.func
+    def exert(o: Operand, v: int) -> vec3:
+        return exert_pairs(
+            v, o.ends, o.entries, o.weights, o.lever, o.first_bent, o.second_bent, o.project, o.response, o.across
+        )
+
+    return Operator(Operand, feel, exert)
+
+
+@functools.cache
+def wide_coupling(real: Real) -> wp.Kernel:
+    """`coupling` with a block of threads a pair of groups."""
+    from pdipc.linear import wide_modes
+
+    scalar = real.scalar
+    k_of = kernels(real)
+    row, mat43 = k_of.row, k_of.mat43
+    wide = wp.float64
+
+    @wp.func
+    def block_of(k: int, s: int, t: int, lever: wp.array(dtype=mat43), hessian: wp.array(dtype=scalar)) -> wp.mat33d:
+        a = row(lever[k], s)
+        b = row(lever[k], t)
+        return wide(hessian[k]) * wp.outer(
+            wp.vec3d(wide(a[0]), wide(a[1]), wide(a[2])), wp.vec3d(wide(b[0]), wide(b[1]), wide(b[2]))
+        )
+
+    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), block_of, mat43, scalar)
 
 
 @functools.cache

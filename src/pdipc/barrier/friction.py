@@ -15,6 +15,7 @@ from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
+from pdipc.linear.wide_pcg import Operator
 
 
 @functools.cache
@@ -148,6 +149,43 @@ def kernels(real: Real) -> SimpleNamespace:
         diagonal_out[v] = d
         energy_out[v] = own
 
+    @wp.func
+    def feel(
+        k: int,
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        block: wp.array(dtype=mat33),
+    ):
+        """Of pair k under p: its force, N, per unit of weight, and p . (Hessian) p."""
+        q = quads[k]
+        a = weights[k]
+        s = a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]]
+        response = block[k] * s
+        return response, wp.dot(response, s)
+
+    @wp.func
+    def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        return low
+
+    @wp.func
+    def exert(
+        v: int,
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=vec4),
+        response: wp.array(dtype=vec3),
+    ) -> vec3:
+        """What the pairs of vertex v make of what they feel."""
+        total = vec3()
+        for i in range(first_entry(v, ends), ends[v]):
+            k = entries[i] // 4
+            total += weights[k][entries[i] % 4] * response[k]
+        return total
+
     @wp.kernel(module=module)
     def stretch(
         span: Span,
@@ -161,13 +199,13 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
-                a = weights[k]
-                response_out[k] = block[k] * (a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]])
+                response, _work = feel(k, p, quads, weights, block)
+                response_out[k] = response
 
     @wp.kernel(module=module)
     def spread(
         first: int,
+        free: wp.array(dtype=scalar),
         ends: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
         weights: wp.array(dtype=vec4),
@@ -175,17 +213,19 @@ def kernels(real: Real) -> SimpleNamespace:
         y: wp.array(dtype=vec3),
     ):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        if ends[v] > low:
-            total = vec3()
-            for i in range(low, ends[v]):
-                k = entries[i] // 4
-                total += weights[k][entries[i] % 4] * response[k]
-            y[v] = y[v] + total
+        if free[v] > zero and ends[v] > first_entry(v, ends):
+            y[v] = y[v] + exert(v, ends, entries, weights, response)
 
-    return SimpleNamespace(copy=copy, copy_ends=copy_ends, evaluate=evaluate, gather=gather, stretch=stretch, spread=spread)
+    return SimpleNamespace(
+        copy=copy,
+        copy_ends=copy_ends,
+        evaluate=evaluate,
+        gather=gather,
+        stretch=stretch,
+        spread=spread,
+        feel=feel,
+        exert=exert,
+    )
 
 
 class FrictionTerm:
@@ -243,15 +283,69 @@ class FrictionTerm:
         return Exerted(quads, weights[:, :, None] * force[:, None, :])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
-        """y += (friction Hessian) p. Recordable."""
+        """y += (friction Hessian) p at free vertices. Recordable."""
         k, device = self.kernels, self.device
         device.launch_list(k.stretch, self.capacity, [self.count, p, self.quads, self.weights, self.block, self.response])
-        device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
+        device.launch(k.spread, len(self.ends), [self.source.free, self.ends, self.entries, self.weights, self.response, y])
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
         inputs = [self.ends, self.entries, self.quads, self.weights, self.block]
-        self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+        if self.device.wide:
+            modes.couple(wide_coupling(self.real), inputs)
+        else:
+            self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+
+    def operand(self):
+        """What the functions of `operator` work on."""
+        o = operator(self.real).Operand()
+        for name in ("count", "quads", "weights", "block", "ends", "entries", "response"):
+            setattr(o, name, getattr(self, name))
+        return o
+
+
+@functools.cache
+def operator(real: Real) -> Operator:
+    """As in `exact`."""
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    feel_pair, exert_pairs = kernels(real).feel, kernels(real).exert
+
+    @wp.struct
+    class Operand:
+        count: wp.array(dtype=wp.int32)
+        quads: wp.array(dtype=wp.vec4i)
+        weights: wp.array(dtype=vec4)
+        block: wp.array(dtype=mat33)
+        ends: wp.array(dtype=wp.int32)
+        entries: wp.array(dtype=wp.int32)
+        response: wp.array(dtype=vec3)
+
+    @wp.func
+    def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
+        response, work = feel_pair(k, p, o.quads, o.weights, o.block)
+        o.response[k] = response
+        return work
+
+    @wp.func
+    def exert(o: Operand, v: int) -> vec3:
+        return exert_pairs(v, o.ends, o.entries, o.weights, o.response)
+
+    return Operator(Operand, feel, exert)
+
+
+@functools.cache
+def wide_coupling(real: Real) -> wp.Kernel:
+    """`coupling` with a block of threads a pair of groups."""
+    from pdipc.linear import wide_modes
+
+    vec4, mat33 = real.vec4, real.mat33
+    wide, widened = wp.float64, wide_modes.functions(real).widened
+
+    @wp.func
+    def block_of(k: int, s: int, t: int, weights: wp.array(dtype=vec4), block: wp.array(dtype=mat33)) -> wp.mat33d:
+        return (wide(weights[k][s]) * wide(weights[k][t])) * widened(block[k])
+
+    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), block_of, vec4, mat33)
 
 
 @functools.cache

@@ -463,7 +463,7 @@ class ActivePairs:
         device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
         device.scan(self.degree, self.ends)
         device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, self.entries])
-        if device.is_cuda:
+        if device.wide:
             device.launch(k.sort_incident, n, [self.ends, self.entries])
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:

@@ -463,7 +463,7 @@ class PatchCulling:
         device.launch(k.fill_blocks, self.count * WIDTH, inputs)
         inputs = [tree, vertex_members, edge_members, triangle_members, s.vertices, of_vertices]
         device.launch(k.fit_patches, self.count, inputs, grain=WIDTH)
-        if device.is_cuda:
+        if device.wide:
             begin = tree.leaves
             while begin > 1:
                 begin //= 2

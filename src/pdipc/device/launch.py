@@ -5,8 +5,11 @@ thread. A recorded graph goes further: every thread replays a graph of its own r
 each kernel, which costs about a microsecond (`system.meet_kernel`) where a hand-over through Python costs sixty. Kernels never
 depend on how a range was cut, so results are the same to the last bit for any number of threads, captured or not.
 
-Two kinds of kernels:
+Three kinds of kernels:
 - over a known range: the first parameter is `first: int`, the index is `first + wp.tid()`; `Device.launch`.
+- over a known range, a block of BLOCK threads an index on CUDA and one thread on the CPU: with `worker = first + wp.tid()` the index is
+  `worker // wp.block_dim()` and the thread of the block `worker % wp.block_dim()`; `Device.launch_blocks`. What the threads of a block
+  add up goes through Warp's tiles, which add in one order.
 - over a list whose length is on the device: the first parameter is `span: Span` and the loop is
       worker = span.first + wp.tid()
       for block in range(worker * span.block, count, span.step * span.block):
@@ -26,13 +29,14 @@ from pdipc.device import threads as shared
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
 
-SCAN_BLOCK = 256  # numbers that a block of CUDA threads scans together
 REDUCE_BLOCK = 512  # numbers that one worker adds up; fixed, so that sums do not depend on the number of threads
 CPU_BLOCK = 64  # list entries that one CPU thread takes at a time
 CUDA_BLOCK = 1
 CPU_SPLIT = 2048  # ranges shorter than this stay on one CPU thread when launched from Python
 GRAPH_SPLIT = 256  # likewise inside a recorded graph, where splitting is cheaper
 CUDA_WORKERS = 1 << 17  # threads that share a list on CUDA
+BLOCK = 256  # threads of a block on CUDA where they work together
+WIDE_BLOCKS = 1024  # blocks that share a sum on CUDA; more numbers make longer strides
 
 
 @wp.struct
@@ -76,6 +80,7 @@ class Device:
 
     name: "cpu", "cuda:0", or None for CUDA where there is one, else the CPU.
     threads: CPU threads; None for `threads.thread_count()`.
+    wide: whether work is cut for many threads that each do little, as on CUDA, or for a few that each do much.
     """
 
     @one_at_a_time
@@ -89,7 +94,7 @@ class Device:
             known = ", ".join(device.alias for device in wp.get_devices())
             raise ValueError(f'device "{name}" is not available; this machine has: {known}') from error
         self.name = self.warp.alias
-        self.is_cuda = self.warp.is_cuda
+        self.is_cuda = self.wide = self.warp.is_cuda
         self.threads = 1 if self.is_cuda else threads or shared.thread_count()
         self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
@@ -137,6 +142,14 @@ class Device:
                 for low, high in itertools.pairwise(bounds)
             ]
             _together([command.launch for command in commands])
+
+    @one_at_a_time
+    def launch_blocks(self, kernel: wp.Kernel, blocks: int, inputs: Sequence[Any], grain: int = BLOCK) -> None:
+        """Runs `kernel(first, *inputs)` for indices 0 to blocks - 1, each by a block of threads on CUDA and by one on the CPU."""
+        if self.wide:
+            wp.launch(kernel, dim=blocks * BLOCK, inputs=[0, *inputs], device=self.warp, block_dim=BLOCK)
+        else:
+            self.launch(kernel, blocks, inputs, grain)
 
     @one_at_a_time
     def launch_list(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
@@ -200,18 +213,12 @@ class Device:
 
         On CUDA by kernels of our own: Warp's scan allocates memory, which CUDA refuses inside the loops of a graph.
         """
-        if self.is_cuda:
+        if self.wide:
             n = counts.size
             k = scan_kernels()
-            wp.launch(
-                k["scan_blocks"],
-                -(-n // SCAN_BLOCK) * SCAN_BLOCK,
-                [n, counts, ends_out],
-                device=self.warp,
-                block_dim=SCAN_BLOCK,
-            )
-            wp.launch(k["scan_ends"], SCAN_BLOCK, [n, ends_out], device=self.warp, block_dim=SCAN_BLOCK)
-            wp.launch(k["add_ends"], n, [SCAN_BLOCK, ends_out], device=self.warp)
+            self.launch_blocks(k["scan_blocks"], -(-n // BLOCK), [n, counts, ends_out])
+            self.launch_blocks(k["scan_ends"], 1, [n, ends_out])
+            self.launch(k["add_ends"], n, [BLOCK, ends_out])
         else:
             self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
 
@@ -264,8 +271,8 @@ def scan_kernels() -> dict[str, wp.Kernel]:
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module)
-    def scan_blocks(count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
-        i = wp.tid()
+    def scan_blocks(first: int, count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
+        i = first + wp.tid()
         value = int(0)
         if i < count:
             value = counts[i]
@@ -274,9 +281,9 @@ def scan_kernels() -> dict[str, wp.Kernel]:
             ends_out[i] = total
 
     @wp.kernel(module=module)
-    def scan_ends(count: int, ends: wp.array(dtype=wp.int32)):
+    def scan_ends(first: int, count: int, ends: wp.array(dtype=wp.int32)):
         """Runs in one block of threads."""
-        lane = wp.tid()
+        lane = first + wp.tid()
         size = wp.block_dim()
         before = int(0)
         for begin in range(0, count, size * size):
@@ -291,8 +298,8 @@ def scan_kernels() -> dict[str, wp.Kernel]:
             before += wp.tile_extract(wp.tile_sum(values), 0)
 
     @wp.kernel(module=module)
-    def add_ends(size: int, ends: wp.array(dtype=wp.int32)):
-        i = wp.tid()
+    def add_ends(first: int, size: int, ends: wp.array(dtype=wp.int32)):
+        i = first + wp.tid()
         if i >= size and i % size != size - 1:
             ends[i] = ends[i] + ends[i // size * size - 1]
 
@@ -301,7 +308,7 @@ def scan_kernels() -> dict[str, wp.Kernel]:
 
 @functools.cache
 def kernels(real: Real) -> dict[str, wp.Kernel]:
-    """Sums and largest values that do not depend on the number of threads: fixed blocks, then one worker over the blocks."""
+    """Sums and largest values that do not depend on the number of threads: fixed blocks, then one worker, or block, over the blocks."""
     scalar = real.scalar
     module = real.module(__name__)
     block = wp.constant(REDUCE_BLOCK)
@@ -336,7 +343,39 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             largest = wp.max(largest, partial[b])
         out[slot] = largest
 
-    return {"sum_blocks": sum_blocks, "sum_partials": sum_partials, "max_blocks": max_blocks, "max_partials": max_partials}  # pyright: ignore[reportReturnType]
+    @wp.kernel(module=module)
+    def wide_sum(
+        first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int
+    ):
+        """Sums of every `stride`-th number from that of the thread on, by block."""
+        worker = first + wp.tid()
+        total = scalar(0.0)
+        for i in range(worker, count, stride):
+            total += values[i]
+        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+        if worker % wp.block_dim() == 0:
+            out[slot + worker // wp.block_dim()] = total
+
+    @wp.kernel(module=module)
+    def wide_max(
+        first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int
+    ):
+        worker = first + wp.tid()
+        largest = values[0]
+        for i in range(worker, count, stride):
+            largest = wp.max(largest, values[i])
+        largest = wp.tile_extract(wp.tile_max(wp.tile(largest)), 0)
+        if worker % wp.block_dim() == 0:
+            out[slot + worker // wp.block_dim()] = largest
+
+    return {
+        "sum_blocks": sum_blocks,
+        "sum_partials": sum_partials,
+        "max_blocks": max_blocks,
+        "max_partials": max_partials,
+        "wide_sum": wide_sum,
+        "wide_max": wide_max,
+    }  # pyright: ignore[reportReturnType]
 
 
 class Reducer:
@@ -344,16 +383,24 @@ class Reducer:
 
     def __init__(self, device: Device, real: Real, count: int):
         self.device, self.count = device, count
-        self.blocks = max(1, -(-count // REDUCE_BLOCK))
+        self.blocks = min(WIDE_BLOCKS, max(1, -(-count // BLOCK))) if device.wide else max(1, -(-count // REDUCE_BLOCK))
         self.partial = wp.zeros(self.blocks, dtype=real.scalar, device=device.warp)
         self.kernels = kernels(real)
 
     def sum(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
-        """out[slot] = sum of values[0:count], always in the same order."""
-        self.device.launch(self.kernels["sum_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
-        self.device.launch_serial(self.kernels["sum_partials"], [self.partial, self.blocks, out, slot])
+        """out[slot] = sum of values[0:count], always in the same order on a device."""
+        self._reduce("sum", values, out, slot)
 
     def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = largest of values[0:count]."""
-        self.device.launch(self.kernels["max_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
-        self.device.launch_serial(self.kernels["max_partials"], [self.partial, self.blocks, out, slot])
+        self._reduce("max", values, out, slot)
+
+    def _reduce(self, how: str, values: wp.array, out: wp.array, slot: int) -> None:
+        k, device = self.kernels, self.device
+        if device.wide:
+            many = self.blocks * BLOCK
+            device.launch_blocks(k[f"wide_{how}"], self.blocks, [values, self.count, many, self.partial, 0])
+            device.launch_blocks(k[f"wide_{how}"], 1, [self.partial, self.blocks, BLOCK, out, slot])
+        else:
+            device.launch(k[f"{how}_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
+            device.launch_serial(k[f"{how}_partials"], [self.partial, self.blocks, out, slot])

@@ -45,7 +45,7 @@ class BlockPcg:
     def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, tolerance: float, most: int):
         n, scalar = matrix.count, real.scalar
         self.device, self.real, self.matrix = device, real, matrix
-        self.modes = RigidModes(device, real, matrix, free)
+        self.modes = self.make_modes(free)
         self.tolerance, self.most = tolerance, most
         self.sums = shared.Sums(device, n)
 
@@ -62,6 +62,9 @@ class BlockPcg:
         self._steps = wp.zeros((most, 2), dtype=scalar, device=device.warp)
         self._kernels, self._pcg = kernels(real), pcg.kernels(real)
         self._advance = _advance_kernel(real)
+
+    def make_modes(self, free: np.ndarray) -> RigidModes:
+        return RigidModes(self.device, self.real, self.matrix, free)
 
     def prepare(self, x: wp.array, couplings: list[Coupling]) -> None:
         """Launches the preconditioner for the matrix and couplings as they are now, at the positions x."""
@@ -315,4 +318,5 @@ def kernels(real: Real) -> SimpleNamespace:
         find_alpha=find_alpha,
         multiply=multiply,
         correct=correct,
+        product=product,
     )

@@ -15,11 +15,10 @@ from typing import Any
 
 import warp as wp
 
-from pdipc.device.launch import Device
+from pdipc.device.launch import BLOCK, Device
 from pdipc.device.precision import Real
 from pdipc.linear import rows
 
-BLOCK = 256  # vertices whose numbers are added up together
 HIDDEN = 16.0  # unit roundoffs of the trace of a 3x3 block: what its rounding errors may hide, and more
 
 # Four sums side by side, because an addition has to wait for the one before.
@@ -46,22 +45,16 @@ class Sums:
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         """Runs `kernel(first, share, count, *inputs)` over all vertices."""
-        if self.device.is_cuda:
-            wp.launch(kernel, self.slots * BLOCK, [0, 1, self.count, *inputs], device=self.device.warp, block_dim=BLOCK)
-        else:
-            self.device.launch(kernel, self.slots, [BLOCK, self.count, *inputs], grain=BLOCK)
+        self.device.launch_blocks(kernel, self.slots, [1 if self.device.wide else BLOCK, self.count, *inputs])
 
     def launch_groups(self, kernel: wp.Kernel, groups: int, inputs: list[Any], grain: int = BLOCK) -> None:
         """Runs `kernel(first, *inputs)` with one thread for each group of vertices on the CPU, one block of threads on CUDA."""
-        if self.device.is_cuda:
-            wp.launch(kernel, groups * BLOCK, [0, *inputs], device=self.device.warp, block_dim=BLOCK)
-        else:
-            self.device.launch(kernel, groups, inputs, grain=grain)
+        self.device.launch_blocks(kernel, groups, inputs, grain)
 
     def conclude(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         """Runs `kernel(first, *inputs)` in one thread on the CPU and in one block of threads on CUDA."""
-        if self.device.is_cuda:
-            wp.launch(kernel, BLOCK, [0, *inputs], device=self.device.warp, block_dim=BLOCK)
+        if self.device.wide:
+            self.device.launch_blocks(kernel, 1, inputs)
         else:
             self.device.launch_serial(kernel, inputs)
 

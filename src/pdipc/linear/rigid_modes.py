@@ -26,47 +26,15 @@ from pdipc.linear.blocks import BlockMatrix
 
 GROUP = 64  # vertices of a group
 DENSE = 48  # groups up to which C is dense
-MOST, CUDA_MOST = 128, 40  # larger meshes get larger groups; one block of CUDA threads takes 3 ms for 40 (measured on an H100)
+MOST = 128  # groups; larger meshes get larger ones
 MODES = 6
-BLOCK = 1024  # CUDA threads that factorize C; a multiple of 32
+LOST = 1.0e-13  # of its diagonal entry: a pivot below is what rounding has left of nothing
 
 # C = L L^T. Row i of the lower triangle lies at i * size and begins at the column low[i / 6] * 6. A pivot that rounding has lost
 # belongs to a motion that the group does not have, such as turning vertices on a line about it: it is made infinite.
-# On CUDA one block of threads makes -C^-1 in place of it, by the sweep operator (Goodnight 1979): what is solved with it then is a product.
 _FACTORIZE = """
     const int size = 6 * groups;
     double* l = c.data;
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x, lanes = blockDim.x;
-    for (int i = lane; i < size; i += lanes) {
-        inverse.data[i] = l[(size_t)i * size + i];
-        for (int j = 0; j < low_of.data[i / 6] * 6; ++j) { l[(size_t)i * size + j] = 0.0; }
-    }
-    __syncthreads();
-    for (int i = lane / 32; i < size; i += lanes / 32) {
-        for (int j = lane % 32; j < i; j += 32) { l[(size_t)j * size + i] = l[(size_t)i * size + j]; }
-    }
-    __syncthreads();
-    for (int k = 0; k < size; ++k) {
-        const double pivot = l[(size_t)k * size + k];
-        const double scale = pivot > 1.0e-13 * inverse.data[k] ? 1.0 / pivot : 0.0;
-        __syncthreads();
-        for (int i = lane / 32; i < size; i += lanes / 32) {
-            const double own = l[(size_t)i * size + k] * scale;
-            if (i != k && own != 0.0) {
-                for (int j = lane % 32; j < size; j += 32) {
-                    if (j != k) { l[(size_t)i * size + j] -= own * l[(size_t)k * size + j]; }
-                }
-            }
-        }
-        __syncthreads();
-        for (int i = lane; i < size; i += lanes) {
-            if (i != k) { l[(size_t)i * size + k] *= scale; l[(size_t)k * size + i] *= scale; }
-        }
-        if (lane == 0) { l[(size_t)k * size + k] = -scale; }
-        __syncthreads();
-    }
-#else
     for (int i = 0; i < size; ++i) {
         const int low = low_of.data[i / 6] * 6;
         double* li = l + (size_t)i * size;
@@ -83,19 +51,17 @@ _FACTORIZE = """
             const double rest = li[j] - ((part[0] + part[1]) + (part[2] + part[3]));
             if (j < i) { li[j] = rest * inverse.data[j]; }
             else {
-                const bool lost = !(rest > 1.0e-13 * own);
+                const bool lost = !(rest > LOST * own);
                 inverse.data[i] = lost ? 0.0 : 1.0 / sqrt(rest);
                 li[i] = lost ? 0.0 : sqrt(rest);
             }
         }
     }
-#endif
 """
 
 _SOLVE = """
     const int size = 6 * groups;
     const double* l = c.data;
-#if !defined(__CUDA_ARCH__)
     double* v = (double*)z.data;
     for (int i = 0; i < size; ++i) {
         const int low = low_of.data[i / 6] * 6;
@@ -115,7 +81,6 @@ _SOLVE = """
         v[i] = own;
         for (int k = low; k < i; ++k) { v[k] -= li[k] * own; }
     }
-#endif
 """
 
 
@@ -129,9 +94,7 @@ class RigidModes:
         self.device, self.real, self.matrix = device, real, matrix
         total = int(free.sum())
         pattern = matrix.pattern + sp.eye_array(matrix.count)
-        label = partition.groups(
-            sp.csr_matrix(pattern), free, group or max(GROUP, total // (CUDA_MOST if device.is_cuda else MOST))
-        )
+        label = partition.groups(sp.csr_matrix(pattern), free, group or max(GROUP, total // MOST))
         self.groups = int(label.max(initial=-1)) + 1
         inside = np.flatnonzero(label >= 0)
         z = sp.csr_matrix((np.ones(len(inside)), (inside, label[inside])), shape=(matrix.count, max(1, self.groups)))
@@ -141,7 +104,7 @@ class RigidModes:
         lower = sp.tril(sp.csr_matrix(coarse[order][:, order])).tocoo()
         low = np.arange(max(1, self.groups))
         np.minimum.at(low, lower.row, lower.col)
-        if self.groups <= DENSE:
+        if self.groups <= DENSE or device.wide:
             low[:] = 0
         members = np.argsort(label, kind="stable")[np.count_nonzero(label < 0) :]
         starts = np.searchsorted(label[members], np.arange(self.groups + 1))
@@ -157,7 +120,6 @@ class RigidModes:
         self.arms = zeros(real.vec3, matrix.count)
         self.c, self.inverse = zeros(wp.float64, size * size), zeros(wp.float64, size)
         self.z = zeros(wp.types.vector(MODES, wp.float64), self.groups)
-        self.sums = wp.zeros_like(self.z)  # of forces, where z cannot be solved for in place
         self.layout = [self.starts, self.members, self.label, self.low, self.groups, self.arms]
         self._kernels = kernels(real)
 
@@ -168,22 +130,13 @@ class RigidModes:
         device.launch(k.gather, self.groups, [*self.layout, m.offsets, m.columns, m.values, m.held, self.c], grain=16 * GROUP)
         for contact in contacts:
             contact.couple(self)
-        inputs = [self.groups, self.low, self.c, self.inverse]
-        if device.is_cuda:
-            wp.launch(k.factorize, BLOCK, [0, *inputs], device=device.warp, block_dim=BLOCK)
-        else:
-            device.launch_serial(k.factorize, inputs)
+        device.launch_serial(k.factorize, [self.groups, self.low, self.c, self.inverse])
 
     def restrict(self, r: wp.array) -> None:
         """Launches z = C^-1 Z^T r."""
         k = self._kernels
-        inputs = [self.starts, self.members, self.arms, r]
-        if self.device.is_cuda:
-            self.device.launch(k.restrict, self.groups, [*inputs, self.sums])
-            self.device.launch(k.multiply, MODES * self.groups, [self.groups, self.c, self.sums, self.z])
-        else:
-            self.device.launch(k.restrict, self.groups, [*inputs, self.z], grain=GROUP)
-            self.device.launch_serial(k.solve, [self.groups, self.low, self.c, self.inverse, self.z])
+        self.device.launch(k.restrict, self.groups, [self.starts, self.members, self.arms, r, self.z], grain=GROUP)
+        self.device.launch_serial(k.solve, [self.groups, self.low, self.c, self.inverse, self.z])
 
 
 @functools.cache
@@ -218,10 +171,9 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = functions(real)
     vec6 = f.vec6
-    wp.types.matrix((MODES, 3), wp.float64)
     wide, _wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
 
-    @wp.func_native(_FACTORIZE)
+    @wp.func_native(_FACTORIZE.replace("LOST", repr(LOST)))
     def factorize_rows(
         groups: int, low_of: wp.array(dtype=wp.int32), c: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64)
     ): ...
@@ -376,16 +328,4 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         solve_rows(groups, low, c, inverse, z)
 
-    @wp.kernel(module=module)
-    def multiply(first: int, groups: int, c: wp.array(dtype=wide), sums: wp.array(dtype=vec6), z_out: wp.array(dtype=vec6)):
-        """z = C^-1 sums, a row a thread, with -C^-1 in c."""
-        i = first + wp.tid()
-        size = MODES * groups
-        total = wide(0.0)
-        for g in range(groups):
-            s = sums[g]
-            for k in range(MODES):
-                total -= c[(MODES * g + k) * size + i] * s[k]
-        z_out[i // MODES][i % MODES] = total
-
-    return SimpleNamespace(center=center, gather=gather, factorize=factorize, restrict=restrict, solve=solve, multiply=multiply)
+    return SimpleNamespace(center=center, gather=gather, factorize=factorize, restrict=restrict, solve=solve)

@@ -27,6 +27,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from pdipc.barrier import exact, friction
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.friction import FrictionTerm
 from pdipc.barrier.pairs import Exerted
@@ -38,6 +39,7 @@ from pdipc.device.sums import BodySums
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.wide_pcg import WidePcg
 from pdipc.nonlinear import status
 
 FRICTION_LAGS = (
@@ -576,7 +578,9 @@ class Newton:
         free = model.free_vertices
         held = model.held
         self.matrix = BlockMatrix(device, real, model.projector, held, free)
-        self.solver = BlockPcg(device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
+        equations = (device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
+        operators = (exact.operator(real), friction.operator(real))
+        self.solver = WidePcg(*equations, operators) if device.wide else BlockPcg(*equations)
         work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
         simulated = [body for body in assembly.bodies if not body.kinematic]
         ranges = [(body.first, body.last) for body in simulated]

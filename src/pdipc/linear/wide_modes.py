@@ -1,0 +1,464 @@
+"""The rigid modes of `rigid_modes`, with the work cut for a GPU: blocks of threads, and none whose work grows with the mesh.
+
+C is kept whole and dense. A block of threads adds up each of its 6x6 blocks: elastic ones from a list of the matrix' entries that was made
+once, those of contacts from the pairs of the vertices of a group, where the pair of groups has any. C^-1 replaces C by block Gauss-Jordan
+elimination, one launch a group and one thread a row of six numbers,
+
+    D = C_kk^-1,   C_kk <- D,   C_kh <- D C_kh,   C_gk <- -C_gk D,   C_gh <- C_gh - C_gk D C_kh,
+
+each from one copy of C into the other: nothing depends on the order of threads, and nobody waits. What is solved with C is then a product.
+"""
+
+import functools
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device, Span
+from pdipc.device.precision import Real
+from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.rigid_modes import LOST, MODES, RigidModes
+
+
+class WideModes(RigidModes):
+    """The groups' vertices are cut into chunks, a block of threads each. chunk_starts: (chunks + 1,) into `members`; chunk_group:
+    (chunks,); sums: (chunks,) the part of each in Z^T r. solved: (size * size,) C^-1 after `prepare`. near: (groups^2,) whether a pair of
+    contact connects two groups.
+    """
+
+    def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, group: int | None = None):
+        super().__init__(device, real, matrix, free, group)
+        starts, label = self.starts.numpy()[: self.groups + 1], self.label.numpy()[: matrix.count]
+        total = int(starts[-1]) if self.groups else 0
+        share = BLOCK * max(1, -(-total // (BLOCK * WIDE_BLOCKS)))
+        cuts = [np.arange(low, high, share) for low, high in zip(starts[:-1], starts[1:], strict=True)]
+        begin = np.concatenate([*cuts, starts[-1:]])
+        owner = np.repeat(np.arange(self.groups), [len(cut) for cut in cuts])
+        self.chunks = len(owner)
+
+        # entries of the matrix between two groups, by pair of groups
+        pattern = sp.coo_matrix(matrix.pattern)
+        row, column = np.asarray(pattern.row), np.asarray(pattern.col)
+        g, h = label[row], label[column]
+        across = np.flatnonzero((g > h) & (h >= 0))
+        key = g[across].astype(np.int64) * self.groups + h[across]
+        order = np.argsort(key, kind="stable")
+        # blocks of the pattern are numbered row by row, as those of the matrix
+        entries = across[order]
+        bounds = np.searchsorted(key[order], np.arange(self.groups**2 + 1))
+
+        def upload(values: np.ndarray) -> wp.array:
+            return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=device.warp)
+
+        def zeros(dtype, count: int) -> wp.array:
+            return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
+
+        size = MODES * self.groups
+        self.chunk_starts, self.chunk_group = upload(begin), upload(owner)
+        self.sums = zeros(wp.types.vector(MODES, wp.float64), self.chunks)
+        self._bounds, self._rows, self._entries = upload(bounds), upload(row[entries]), upload(entries)
+        self._other, self._lead = zeros(wp.float64, size * size), zeros(wp.float64, size)
+        self.near = zeros(wp.int32, self.groups**2)
+        self.solved = self._other if self.groups % 2 else self.c
+        self._wide = kernels(real)
+
+    def prepare(self, x: wp.array, contacts: list) -> None:
+        k, device, m, groups = self._wide, self.device, self.matrix, self.groups
+        device.launch_blocks(k.center, groups, [self.starts, self.members, x, self.arms])
+        layout = [self.starts, self.members, self.label, groups, self.arms, self._bounds, self._rows, self._entries]
+        matrix = [m.offsets, m.columns, m.values, m.held]
+        device.launch_blocks(k.gather, groups**2, [*layout, *matrix, self.c, self.near])
+        for contact in contacts:
+            inputs = [contact.count, contact.quads, self.label, groups, self.near]
+            device.launch_list(k.mark, contact.capacity, inputs)
+        for contact in contacts:
+            contact.couple(self)
+        device.launch(k.lead, MODES * groups, [MODES * groups, self.c, self._lead])
+        here, there = self.c, self._other
+        for pivot in range(groups):
+            device.launch(k.eliminate, MODES * groups**2, [groups, pivot, self._lead, here, there])
+            here, there = there, here
+
+    def couple(self, kernel: wp.Kernel, inputs: list) -> None:
+        """Launches a kernel of `coupling` over all pairs of groups."""
+        layout = [self.starts, self.members, self.label, self.groups, self.arms, self.near]
+        self.device.launch_blocks(kernel, self.groups**2, [*layout, *inputs, self.c])
+
+    def restrict(self, r: wp.array) -> None:
+        """Launches the sums Z^T r, chunk by chunk."""
+        inputs = [self.chunk_starts, self.members, self.arms, r, self.sums]
+        self.device.launch_blocks(self._wide.restrict, self.chunks, inputs)
+
+
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    vec3, mat33 = real.vec3, real.mat33
+    wide, wide33 = wp.float64, wp.mat33d
+    vec6 = wp.types.vector(MODES, wide)
+
+    @wp.func
+    def widened(a: mat33) -> wide33:
+        return wide33(
+            wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
+            wide(a[1, 0]), wide(a[1, 1]), wide(a[1, 2]),
+            wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
+        )  # fmt: skip
+
+    @wp.func
+    def skew(a: vec3) -> wide33:
+        zero = wide(0.0)
+        x = wide(a[0])
+        y = wide(a[1])
+        z = wide(a[2])
+        return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
+
+    @wp.func
+    def of_block(value: wide33) -> wide33:
+        """The sum over the threads of a block, for each of them."""
+        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
+
+    @wp.func
+    def block_sum(value: vec6) -> vec6:
+        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
+
+    @wp.func
+    def part(i: int, j: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33) -> wide:
+        """An entry of the 6x6 block."""
+        if i < 3:
+            if j < 3:
+                return tt[i, j]
+            return tr[i, j - 3]
+        if j < 3:
+            return rt[i - 3, j]
+        return rr[i - 3, j - 3]
+
+    @wp.func
+    def add(
+        lane: int,
+        groups: int,
+        g: int,
+        h: int,
+        tt: wide33,
+        tr: wide33,
+        rt: wide33,
+        rr: wide33,
+        c: wp.array(dtype=wide),
+    ):
+        """C_gh += the block, and C_hg its transpose, by the first threads of the block that has them alone."""
+        size = MODES * groups
+        for n in range(lane, MODES * MODES, wp.block_dim()):
+            i = n // MODES
+            j = n % MODES
+            at = (MODES * g + i) * size + MODES * h + j
+            value = c[at] + part(i, j, tt, tr, rt, rr)
+            c[at] = value
+            if g != h:
+                c[(MODES * h + j) * size + MODES * g + i] = value
+
+    return SimpleNamespace(
+        widened=widened, skew=skew, of_block=of_block, block_sum=block_sum, part=part, add=add, vec6=vec6
+    )
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    wide, wide33 = wp.float64, wp.mat33d
+    module = real.module(__name__)
+    f = functions(real)
+    vec6 = f.vec6
+    mat66 = wp.types.matrix((MODES, MODES), wide)
+    lost = wp.constant(wide(LOST))
+    from pdipc.linear import rigid_modes
+
+    mode = rigid_modes.functions(real).mode
+
+    @wp.func
+    def total_of(value: vec3) -> vec3:
+        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
+
+    @wp.kernel(module=module)
+    def center(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        arms_out: wp.array(dtype=vec3),
+    ):
+        worker = first + wp.tid()
+        g = worker // wp.block_dim()
+        begin = starts[g] + worker % wp.block_dim()
+        end = starts[g + 1]
+        number = scalar(end - starts[g])
+        origin = x[members[starts[g]]]
+        middle = vec3()
+        for k in range(begin, end, wp.block_dim()):
+            middle += x[members[k]] - origin
+        middle = total_of(middle) / number
+        square = scalar(0.0)
+        for k in range(begin, end, wp.block_dim()):
+            square += wp.length_sq((x[members[k]] - origin) - middle)
+        square = wp.tile_extract(wp.tile_sum(wp.tile(square)), 0)
+        scale = scalar(1.0)
+        if square > scalar(0.0):
+            scale = scalar(1.0) / wp.sqrt(square / number)
+        for k in range(begin, end, wp.block_dim()):
+            arms_out[members[k]] = scale * ((x[members[k]] - origin) - middle)
+
+    @wp.kernel(module=module)
+    def gather(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        groups: int,
+        arms: wp.array(dtype=vec3),
+        bounds: wp.array(dtype=wp.int32),
+        rows: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        held: wp.array(dtype=scalar),
+        c: wp.array(dtype=wide),
+        near_out: wp.array(dtype=wp.int32),
+    ):
+        """C_gh = sum over the vertices i of g of Z_i^T (held_i Z_i + sum_j K_ij (Z_j - Z_i)), elastic; see `rigid_modes`."""
+        worker = first + wp.tid()
+        lane = worker % wp.block_dim()
+        g = (worker // wp.block_dim()) // groups
+        h = (worker // wp.block_dim()) % groups
+        if h > g:
+            return
+        tt = wide33()
+        tr = wide33()
+        rt = wide33()
+        rr = wide33()
+        if h == g:
+            identity = wide33(wp.identity(n=3, dtype=wide))
+            for m in range(starts[g] + lane, starts[g + 1], wp.block_dim()):
+                i = members[m]
+                own = f.skew(arms[i])
+                mass = wide(held[i])
+                tt += mass * identity
+                tr -= mass * own
+                rt += mass * own
+                rr -= mass * (own * own)
+                for e in range(offsets[i], offsets[i + 1]):
+                    j = columns[e]
+                    k = f.widened(values[e])
+                    if label[j] == g:
+                        # translations cancel, rotations leave the difference of the arms
+                        turned = k * (own - f.skew(arms[j]))
+                        tr += turned
+                        rr += own * turned
+                    else:
+                        turned = k * own
+                        tt -= k
+                        tr += turned
+                        rt -= own * k
+                        rr += own * turned
+        else:
+            pair = g * groups + h
+            for n in range(bounds[pair] + lane, bounds[pair + 1], wp.block_dim()):
+                i = rows[n]
+                j = columns[entries[n]]
+                k = f.widened(values[entries[n]])
+                own = f.skew(arms[i])
+                far = f.skew(arms[j])
+                tt += k
+                tr -= k * far
+                rt += own * k
+                rr -= own * (k * far)
+        if h == g or bounds[g * groups + h + 1] > bounds[g * groups + h]:
+            tt = f.of_block(tt)
+            tr = f.of_block(tr)
+            rt = f.of_block(rt)
+            rr = f.of_block(rr)
+        size = MODES * groups
+        for n in range(lane, MODES * MODES, wp.block_dim()):
+            i = n // MODES
+            j = n % MODES
+            value = f.part(i, j, tt, tr, rt, rr)
+            c[(MODES * g + i) * size + MODES * h + j] = value
+            if g != h:
+                c[(MODES * h + j) * size + MODES * g + i] = value
+        if lane == 0:
+            near_out[g * groups + h] = 0
+
+    @wp.kernel(module=module)
+    def mark(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        label: wp.array(dtype=wp.int32),
+        groups: int,
+        near_out: wp.array(dtype=wp.int32),
+    ):
+        """near = 1 for the groups of every pair; whoever writes, writes the same."""
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                for s in range(4):
+                    g = label[quads[k][s]]
+                    for t in range(4):
+                        h = label[quads[k][t]]
+                        if h >= 0 and g >= h:
+                            near_out[g * groups + h] = 1
+
+    @wp.kernel(module=module)
+    def lead(first: int, size: int, c: wp.array(dtype=wide), lead_out: wp.array(dtype=wide)):
+        """The diagonal, to tell what a pivot was before rounding took it."""
+        i = first + wp.tid()
+        lead_out[i] = c[i * size + i]
+
+    @wp.func
+    def solve_pivot(pivot: int, size: int, leading: wp.array(dtype=wide), c: wp.array(dtype=wide), a: vec6) -> vec6:
+        """C_kk^-1 a by L D L^T; a pivot that rounding has lost is infinite."""
+        l = mat66()
+        d = vec6()
+        inverse = vec6()
+        at = MODES * pivot
+        for j in range(MODES):
+            own = c[(at + j) * size + at + j]
+            for m in range(j):
+                own -= l[j, m] * l[j, m] * d[m]
+            if own > lost * leading[at + j]:
+                d[j] = own
+                inverse[j] = wide(1.0) / own
+            for i in range(j + 1, MODES):
+                below = c[(at + i) * size + at + j]
+                for m in range(j):
+                    below -= l[i, m] * l[j, m] * d[m]
+                l[i, j] = below * inverse[j]
+        w = vec6()
+        for i in range(MODES):
+            own = a[i]
+            for m in range(i):
+                own -= l[i, m] * w[m]
+            w[i] = own
+        w = wp.cw_mul(w, inverse)
+        for back in range(MODES):
+            i = MODES - 1 - back
+            own = w[i]
+            for m in range(i + 1, MODES):
+                own -= l[m, i] * w[m]
+            w[i] = own
+        return w
+
+    @wp.kernel(module=module)
+    def eliminate(
+        first: int,
+        groups: int,
+        pivot: int,
+        leading: wp.array(dtype=wide),
+        c: wp.array(dtype=wide),
+        c_out: wp.array(dtype=wide),
+    ):
+        """One step of block Gauss-Jordan: row i of the block of columns of group h."""
+        worker = first + wp.tid()
+        i = worker // groups
+        h = worker % groups
+        size = MODES * groups
+        inside = i // MODES == pivot
+        a = vec6()
+        for k in range(MODES):
+            if inside:
+                a[k] = wp.where(i % MODES == k, wide(1.0), wide(0.0))
+            else:
+                a[k] = c[i * size + MODES * pivot + k]
+        w = solve_pivot(pivot, size, leading, c, a)
+        for j in range(MODES):
+            at = i * size + MODES * h + j
+            if h == pivot:
+                c_out[at] = wp.where(inside, w[j], -w[j])
+            else:
+                total = wide(0.0)
+                for k in range(MODES):
+                    total += w[k] * c[(MODES * pivot + k) * size + MODES * h + j]
+                c_out[at] = wp.where(inside, total, c[at] - total)
+
+    @wp.kernel(module=module)
+    def restrict(
+        first: int,
+        chunk_starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        arms: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+        sums_out: wp.array(dtype=vec6),
+    ):
+        worker = first + wp.tid()
+        chunk = worker // wp.block_dim()
+        total = vec6()
+        for k in range(chunk_starts[chunk] + worker % wp.block_dim(), chunk_starts[chunk + 1], wp.block_dim()):
+            total += mode(arms[members[k]], r[members[k]])
+        total = f.block_sum(total)
+        if worker % wp.block_dim() == 0:
+            sums_out[chunk] = total
+
+    return SimpleNamespace(center=center, gather=gather, mark=mark, lead=lead, eliminate=eliminate, restrict=restrict)
+
+
+def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type, second_type: type) -> wp.Kernel:
+    """A kernel that adds the Hessians of pairs to C, a block of threads a pair of groups.
+
+    block_of(k, s, t, a, b): a Warp function, the 3x3 block of pair k between its vertices s and t, in double precision, from two arrays
+    of what each pair has.
+    """
+    f, vec3 = functions(real), real.vec3
+    wide, wide33 = wp.float64, wp.mat33d
+
+    @wp.kernel(module=module)
+    def couple_groups(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        groups: int,
+        arms: wp.array(dtype=vec3),
+        near: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        a: wp.array(dtype=first_type),
+        b: wp.array(dtype=second_type),
+        c: wp.array(dtype=wide),
+    ):
+        worker = first + wp.tid()
+        lane = worker % wp.block_dim()
+        g = (worker // wp.block_dim()) // groups
+        h = (worker // wp.block_dim()) % groups
+        if h > g or near[g * groups + h] == 0:
+            return
+        tt = wide33()
+        tr = wide33()
+        rt = wide33()
+        rr = wide33()
+        for m in range(starts[g] + lane, starts[g + 1], wp.block_dim()):
+            v = members[m]
+            begin = int(0)
+            if v > 0:
+                begin = ends[v - 1]
+            for e in range(begin, ends[v]):
+                k = entries[e] // 4
+                s = entries[e] % 4
+                for t in range(4):
+                    i = quads[k][t]
+                    if label[i] == h:
+                        block = block_of(k, s, t, a, b)
+                        own = f.skew(arms[v])
+                        turned = block * f.skew(arms[i])
+                        tt += block
+                        tr -= turned
+                        rt += own * block
+                        rr -= own * turned
+        tt = f.of_block(tt)
+        tr = f.of_block(tr)
+        rt = f.of_block(rt)
+        rr = f.of_block(rr)
+        f.add(lane, groups, g, h, tt, tr, rt, rr, c)
+
+    return couple_groups  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
