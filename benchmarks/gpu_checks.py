@@ -229,12 +229,12 @@ def contacts(place: Device, precision: str) -> dict[str, np.ndarray]:
                 break
             work.candidates.invalidate()
         for pairs in work.candidates.lists:
-            found[f"{pairs.kind} pairs by {method}"] = pairs.count.numpy()[:1]
-        found[f"passes by {method}"] = work.truncation.passes.numpy()
-        found[f"truncated by {method}"] = work.truncation.x_end.numpy()
+            found[f"{pairs.kind} pairs by {method}"] = pairs.count.numpy()[:1].copy()  # on the CPU a view
+        found[f"passes by {method}"] = work.truncation.passes.numpy().copy()
+        found[f"truncated by {method}"] = work.truncation.x_end.numpy().copy()
         work.list_pairs(work.truncation.x_end)
-        found[f"barriers by {method}"] = work.pairs.count.numpy()[:1]
-        found[f"barrier forces by {method}"] = work.pairs.forces(work.truncation.x_end).numpy()
+        found[f"barriers by {method}"] = work.pairs.count.numpy()[:1].copy()  # on the CPU a view
+        found[f"barrier forces by {method}"] = work.pairs.forces(work.truncation.x_end).numpy().copy()
     return found
 
 
@@ -341,23 +341,24 @@ def prepare(folder: Path, arch: int | None, small: bool, chosen: str) -> None:
         compile_kernels(folder / "kernels", arch)
 
 
-def compile_kernels(folder: Path, arch: int) -> None:
+def compile_kernels(folder: Path, arch: int, precisions_of: tuple[str, ...] = PRECISIONS) -> None:
     """Every kernel of the package, to machine code for `arch`, into a cache that WARP_CACHE_PATH may name on another machine."""
     from tests.linear.test_cuda_code import FACTORIES as LINEAR
     from tests.test_cuda_code import FACTORIES
 
     cache, start, total = folder.resolve() / wp.config.version, time.perf_counter(), 0
     modules = {}
-    for precision in PRECISIONS:
+    for precision in precisions_of:
         for make in (*FACTORIES.values(), *LINEAR.values()):
             made = make(real(precision))
             kernels = (made if isinstance(made, dict) else vars(made)).values()
             modules |= {kernel.module.name: kernel.module for kernel in kernels if isinstance(kernel, wp.Kernel)}
     for module in modules.values():
-        for binary in wp.compile_aot_module(
-            module, arch=arch, use_ptx=False, module_dir=cache / module.get_module_identifier()
-        ):
-            total += os.path.getsize(binary)
-            for source in Path(binary).parent.glob("*.cu"):
+        place = cache / module.get_module_identifier()
+        if not place.exists():
+            wp.compile_aot_module(module, arch=arch, use_ptx=False, module_dir=place)
+            for source in place.glob("*.cu"):
                 source.unlink()
+            print(f"{place.name}: {time.perf_counter() - start:.0f} s", flush=True)
+        total += sum(os.path.getsize(each) for each in place.iterdir())
     print(f"{cache}: {len(modules)} modules, {total / 1e6:.1f} MB, {time.perf_counter() - start:.0f} s")

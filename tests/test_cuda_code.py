@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from device.emulated import Emulated
 
 from pdipc.barrier import exact, friction, pairs, restitution
 from pdipc.collision import bvh, candidates, islands, patches, queries, truncation
@@ -12,7 +13,7 @@ from pdipc.device import launch as parallel
 from pdipc.device.precision import real
 from pdipc.integration import inertia
 from pdipc.integration import loads as forces
-from pdipc.linear import block_pcg, blocks, rigid_modes
+from pdipc.linear import block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
 from pdipc.nonlinear import anderson, local_global, newton, sums
 from pdipc.paper_mode import energy_rate, printed
 from pdipc.paper_mode import targets as paper
@@ -31,6 +32,9 @@ FACTORIES = {
     "blocks": blocks.kernels,
     "rigid modes": rigid_modes.kernels,
     "block pcg": block_pcg.kernels,
+    "wide modes": wide_modes.kernels,
+    "wide couplings": lambda precision: {"a": exact.wide_coupling(precision), "b": friction.wide_coupling(precision)},
+    "wide pcg": lambda precision: wide_pcg.kernels(precision, exact.operator(precision), friction.operator(precision)),
     "flags": lambda precision: {"positive": newton._positive(precision)},
     "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),
@@ -64,21 +68,23 @@ def test_compiles(name, precision, tmp_path):
             assert binary.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("block", [1, 4, 256])
 @pytest.mark.parametrize("count", [1, 3, 255, 256, 257, 70_000])
-def test_scan_in_blocks(count, block):
-    """The sums that CUDA takes by its own kernels, from what each kernel does to a block of threads."""
+def test_scan_in_blocks(count):
+    """The sums that CUDA takes by its own kernels, with blocks of threads emulated."""
     counts = np.random.default_rng(count).integers(0, 100, count).astype(np.int32)
-    ends = wp.array(
-        np.concatenate([np.cumsum(part) for part in np.split(counts, range(block, count, block))]), dtype=wp.int32, device="cpu"
-    )
-    kernels = parallel.scan_kernels()
-    if block == 1:  # the CPU runs blocks of one thread
-        ends.zero_()
-        wp.launch(kernels["scan_blocks"], count, [count, wp.array(counts, device="cpu"), ends], device="cpu")
-        wp.launch(kernels["scan_ends"], 1, [count, ends], device="cpu")
-    else:
-        host = ends.numpy()
-        host[block - 1 :: block] = np.cumsum(host[block - 1 :: block])
-    wp.launch(kernels["add_ends"], count, [block, ends], device="cpu")
+    ends = wp.zeros(count, dtype=wp.int32, device="cpu")
+    Emulated().scan(wp.array(counts, device="cpu"), ends)
     assert np.array_equal(ends.numpy(), np.cumsum(counts))
+
+
+@pytest.mark.parametrize("count", [1, 255, 256, 257, 300_000])
+def test_reductions_in_blocks(count):
+    """Sums to rounding, the largest to the bit."""
+    values = np.random.default_rng(count).uniform(-1.0, 1.0, count)
+    place = Emulated()
+    reducer, out = parallel.Reducer(place, real("float64"), count), wp.zeros(2, dtype=wp.float64, device="cpu")
+    given = wp.array(values, device="cpu")
+    reducer.sum(given, out, 0)
+    reducer.max(given, out, 1)
+    assert abs(out.numpy()[0] - np.sum(values)) < 1e-15 * np.abs(values).sum()
+    assert out.numpy()[1] == values.max()

@@ -107,5 +107,8 @@ def test_groups_are_the_same_as_those_of_the_cpu():
     model = crowded()
     work, *_ = assembled(model, YES)
     free, matrix = model.free_vertices, work.method.matrix
-    found = [cls(place, model.real, matrix, free, 10).label.numpy() for cls, place in ((RigidModes, model.device), (WideModes, Emulated()))]
+    found = [
+        cls(place, model.real, matrix, free, 10).label.numpy()
+        for cls, place in ((RigidModes, model.device), (WideModes, Emulated()))
+    ]
     assert np.array_equal(*found)

@@ -349,9 +349,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         v = first + wp.tid()
         if free[v] > zero and ends[v] > first_entry(v, ends):
-            y[v] = y[v] + exert(
-                v, ends, entries, weights, lever, first_bent, second_bent, project, response, across
-            )
+            y[v] = y[v] + exert(v, ends, entries, weights, lever, first_bent, second_bent, project, response, across)
 
     return SimpleNamespace(
         differentiate=differentiate,

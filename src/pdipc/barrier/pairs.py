@@ -211,19 +211,29 @@ def kernels(real: Real) -> SimpleNamespace:
                     entries_out[ends[v] - left] = k * 4 + s
 
     @wp.kernel(module=module)
-    def sort_incident(first: int, ends: wp.array(dtype=wp.int32), entries: wp.array(dtype=wp.int32)):
-        """Puts a vertex's pairs in order, so that its sums do not depend on how threads raced to fill the list."""
-        v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        for i in range(low + 1, ends[v]):
-            e = entries[i]
-            j = int(i)
-            while j > low and entries[wp.max(j - 1, 0)] > e:
-                entries[j] = entries[j - 1]
-                j -= 1
-            entries[j] = e
+    def sort_incident(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        ends: wp.array(dtype=wp.int32),
+        entries: wp.array(dtype=wp.int32),
+        sorted_out: wp.array(dtype=wp.int32),
+    ):
+        """Puts a vertex's pairs in order, so that its sums do not depend on how threads raced to fill the list: each goes after as many
+        as are less."""
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                for s in range(4):
+                    v = quads[k][s]
+                    low = int(0)
+                    if v > 0:
+                        low = ends[v - 1]
+                    before = int(0)
+                    for i in range(low, ends[v]):
+                        if entries[i] < k * 4 + s:
+                            before += 1
+                    sorted_out[low + before] = k * 4 + s
 
     @wp.kernel(module=module)
     def linearize(
@@ -421,6 +431,7 @@ class ActivePairs:
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
+        self.unsorted = wp.zeros(4 * capacity if self.device.wide else 1, dtype=wp.int32, device=self.device.warp)
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
 
@@ -462,9 +473,11 @@ class ActivePairs:
         device.launch(k.clear, n, [self.degree])
         device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
         device.scan(self.degree, self.ends)
-        device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, self.entries])
+        filled = self.unsorted if device.wide else self.entries
+        device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, filled])
         if device.wide:
-            device.launch(k.sort_incident, n, [self.ends, self.entries])
+            inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries]
+            device.launch_list(k.sort_incident, self.capacity, inputs)
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:
         """Forces at the iterate x~ added to rhs, and their Hessian and block diagonal there. Recordable.

@@ -108,9 +108,17 @@ def kernels(real: Real) -> SimpleNamespace:
         return sweep_pairs
 
     @wp.kernel(module=module)
-    def reset(first: int, multiplier_out: wp.array(dtype=wp.int32), any_hit_out: wp.array(dtype=wp.int32)):
+    def reset(
+        first: int,
+        groups: int,
+        multiplier_out: wp.array(dtype=wp.int32),
+        least_out: wp.array(dtype=wp.int32),
+        any_hit_out: wp.array(dtype=wp.int32),
+    ):
         i = first + wp.tid()
         multiplier_out[i] = unit
+        if i < groups:
+            least_out[i] = unit
         if i == 0:
             any_hit_out[0] = 0
 
@@ -177,6 +185,23 @@ def kernels(real: Real) -> SimpleNamespace:
             least = wp.min(least, multiplier[members[k]])
         for k in range(ends[r], ends[r + 1]):
             multiplier[members[k]] = least
+
+    @wp.kernel(module=module)
+    def find_least(
+        first: int, group_of: wp.array(dtype=wp.int32), multiplier: wp.array(dtype=wp.int32), least: wp.array(dtype=wp.int32)
+    ):
+        """The least time of each rigid obstacle; the least of integers does not depend on who is first."""
+        i = first + wp.tid()
+        if group_of[i] >= 0 and multiplier[i] < unit:
+            wp.atomic_min(least, group_of[i], multiplier[i])
+
+    @wp.kernel(module=module)
+    def spread_least(
+        first: int, group_of: wp.array(dtype=wp.int32), least: wp.array(dtype=wp.int32), multiplier: wp.array(dtype=wp.int32)
+    ):
+        i = first + wp.tid()
+        if group_of[i] >= 0:
+            multiplier[i] = wp.min(multiplier[i], least[group_of[i]])
 
     @wp.kernel(module=module)
     def shorten(
@@ -281,6 +306,8 @@ def kernels(real: Real) -> SimpleNamespace:
         spread_vertex_triangle=spread("vertex_triangle"),
         spread_edge_edge=spread("edge_edge"),
         together=together,
+        find_least=find_least,
+        spread_least=spread_least,
         shorten=shorten,
         grade=grade,
         place=place,
@@ -324,6 +351,11 @@ class Truncation:
         self.group_ends = wp.array(ends, device=self.device.warp)
         members = np.concatenate([np.zeros(0), *groups, np.zeros(1)]).astype(np.int32)
         self.group_members = wp.array(members, device=self.device.warp)
+        group_of = np.full(self.n, -1, dtype=np.int32)
+        for group, vertices in enumerate(groups):
+            group_of[vertices] = group
+        self.group_of = wp.array(group_of, device=self.device.warp)
+        self.least = wp.zeros(max(1, len(groups)), dtype=wp.int32, device=self.device.warp)
 
     def truncate(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
         """Fills u_end, x_end = base + u_end and `passes`, the number of passes that found hits: 0 where the whole motion is free.
@@ -343,7 +375,7 @@ class Truncation:
         k, device, n = self.kernels, self.device, self.n
 
         def sweep() -> None:
-            device.launch(k.reset, n, [self.multiplier, self.any_hit])
+            device.launch(k.reset, n, [self.group_count, self.multiplier, self.least, self.any_hit])
             for c in candidates.lists:
                 inputs = [
                     c.count,
@@ -376,7 +408,10 @@ class Truncation:
             device.launch_serial(k.decide, [self.any_hit, self.passes, self.going])
 
         def shorten() -> None:
-            if self.group_count:
+            if self.group_count and device.wide:
+                device.launch(k.find_least, n, [self.group_of, self.multiplier, self.least])
+                device.launch(k.spread_least, n, [self.group_of, self.least, self.multiplier])
+            elif self.group_count:
                 device.launch(k.together, self.group_count, [self.group_ends, self.group_members, self.multiplier])
             device.launch(k.shorten, n, [self.multiplier, self.passes, self.fraction, self.first_fraction])
             if self.neighbours is not None:

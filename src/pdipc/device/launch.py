@@ -344,9 +344,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         out[slot] = largest
 
     @wp.kernel(module=module)
-    def wide_sum(
-        first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int
-    ):
+    def wide_sum(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
         """Sums of every `stride`-th number from that of the thread on, by block."""
         worker = first + wp.tid()
         total = scalar(0.0)
@@ -357,9 +355,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             out[slot + worker // wp.block_dim()] = total
 
     @wp.kernel(module=module)
-    def wide_max(
-        first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int
-    ):
+    def wide_max(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
         worker = first + wp.tid()
         largest = values[0]
         for i in range(worker, count, stride):

@@ -1,4 +1,4 @@
-"""Energies by body: sums of fixed blocks, so that they depend neither on threads nor on what other bodies do."""
+"""Energies by body: sums of fixed blocks of BLOCK numbers, so that they depend neither on threads nor on what other bodies do."""
 
 import functools
 import itertools
@@ -7,9 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from pdipc.device.launch import Device
-
-BLOCK = 256  # numbers that one worker adds up
+from pdipc.device.launch import BLOCK, Device
 
 
 @functools.cache
@@ -26,11 +24,14 @@ def kernels() -> SimpleNamespace:
         offset: int,
         partial_out: wp.array(dtype=wp.float64),
     ):
-        b = first + wp.tid()
+        worker = first + wp.tid()
+        b = worker // wp.block_dim()
         total = wp.float64(0.0)
-        for i in range(starts[b], ends[b]):
+        for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
             total += values[i]
-        partial_out[offset + b] = total
+        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+        if worker % wp.block_dim() == 0:
+            partial_out[offset + b] = total
 
     @wp.kernel(module=module)
     def add_bodies(
@@ -40,11 +41,14 @@ def kernels() -> SimpleNamespace:
         partial: wp.array(dtype=wp.float64),
         total_out: wp.array(dtype=wp.float64),
     ):
-        body = first + wp.tid()
+        worker = first + wp.tid()
+        body = worker // wp.block_dim()
         total = wp.float64(0.0)
-        for k in range(offsets[body], offsets[body + 1]):
+        for k in range(offsets[body] + worker % wp.block_dim(), offsets[body + 1], wp.block_dim()):
             total += partial[blocks[k]]
-        total_out[body] = total
+        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+        if worker % wp.block_dim() == 0:
+            total_out[body] = total
 
     return SimpleNamespace(add_blocks=add_blocks, add_bodies=add_bodies)
 
@@ -83,6 +87,7 @@ class BodySums:
         for values, (starts, ends, at, count) in zip(arrays, self._cuts, strict=True):
             if count:
                 inputs = [starts, ends, values, at, self._partial]
-                self.device.launch(self._kernels.add_blocks, count, inputs, grain=BLOCK // 4)
+                self.device.launch_blocks(self._kernels.add_blocks, count, inputs, grain=BLOCK // 4)
         if self.bodies:
-            self.device.launch(self._kernels.add_bodies, self.bodies, [self._offsets, self._blocks, self._partial, total_out])
+            inputs = [self._offsets, self._blocks, self._partial, total_out]
+            self.device.launch_blocks(self._kernels.add_bodies, self.bodies, inputs, grain=1)

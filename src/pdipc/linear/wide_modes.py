@@ -158,9 +158,7 @@ def functions(real: Real) -> SimpleNamespace:
             if g != h:
                 c[(MODES * h + j) * size + MODES * g + i] = value
 
-    return SimpleNamespace(
-        widened=widened, skew=skew, of_block=of_block, block_sum=block_sum, part=part, add=add, vec6=vec6
-    )
+    return SimpleNamespace(widened=widened, skew=skew, of_block=of_block, block_sum=block_sum, part=part, add=add, vec6=vec6)
 
 
 @functools.cache

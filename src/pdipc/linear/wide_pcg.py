@@ -117,9 +117,7 @@ class WidePcg(BlockPcg):
                 device.launch_blocks(wide.multiply, slots, [self._flags, old, *product, self._w, self._delta])
                 state = [self._flags, self._pair, old, new]
                 both = [len(contacts), *operands]
-                device.launch_blocks(
-                    wide.advance, modes.chunks, [*state, *sums, *told, *chunks, *both, *vectors, modes.sums]
-                )
+                device.launch_blocks(wide.advance, modes.chunks, [*state, *sums, *told, *chunks, *both, *vectors, modes.sums])
                 device.launch_blocks(wide.correct, modes.chunks, [self._flags, new, *correction])
 
         device.loop(self._going, iterate)
@@ -141,9 +139,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
     row_product = block_pcg.kernels(real).product
 
     @wp.kernel(module=module)
-    def begin(
-        first: int, going: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32), flags_out: wp.array(dtype=wp.int32)
-    ):
+    def begin(first: int, going: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32), flags_out: wp.array(dtype=wp.int32)):
         flags_out[GOING] = going[0]
         flags_out[LEFT] = left[0]
         flags_out[STARTED] = 0

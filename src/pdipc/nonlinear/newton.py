@@ -137,6 +137,15 @@ def kernels(real: Real) -> SimpleNamespace:
         """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
         return (k * count) / number + (k * 37) % (count / number)
 
+    @wp.func
+    def of_block(value: wp.vec3d) -> wp.vec3d:
+        """The sum over a block of threads; the CPU's are of one."""
+        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
+
+    @wp.func
+    def number_of_block(value: wide) -> wide:
+        return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+
     @wp.kernel(module=module)
     def find_turn(
         first: int,
@@ -151,40 +160,52 @@ def kernels(real: Real) -> SimpleNamespace:
         turn_out: wp.array(dtype=wp.vec3d),
     ):
         """By how much the step p rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held."""
-        b = first + wp.tid()
+        worker = first + wp.tid()
+        b = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
         start = starts[b]
         count = ends[b] - start
         number = wp.min(count, SAMPLES)
+        if whole[b] == 0:
+            number = 0
         origin = base[start]
+        total = wide(0.0)
         center = wp.vec3d()
-        turn = wp.vec3d()
-        if whole[b] != 0:
-            total = wide(0.0)
-            mean = wp.vec3d()
-            for k in range(number):
-                i = start + sampled(k, number, count)
-                m = wide(mass[i])
-                total += m
-                center += m * widened((base[i] - origin) + u[i])
-                mean += m * widened(p[i])
+        mean = wp.vec3d()
+        for k in range(lane, number, wp.block_dim()):
+            i = start + sampled(k, number, count)
+            m = wide(mass[i])
+            total += m
+            center += m * widened((base[i] - origin) + u[i])
+            mean += m * widened(p[i])
+        total = number_of_block(total)
+        center = of_block(center)
+        mean = of_block(mean)
+        if total > wide(0.0):
             center = center / total
             mean = mean / total
-            momentum = wp.vec3d()
-            square = wide(0.0)
-            outer = wp.mat33d()
-            for k in range(number):
-                i = start + sampled(k, number, count)
-                m = wide(mass[i])
-                arm = widened((base[i] - origin) + u[i]) - center
-                momentum += m * wp.cross(arm, widened(p[i]) - mean)
-                square += m * wp.length_sq(arm)
-                outer += m * wp.outer(arm, arm)
+        momentum = wp.vec3d()
+        square = wide(0.0)
+        outer = wp.mat33d()
+        for k in range(lane, number, wp.block_dim()):
+            i = start + sampled(k, number, count)
+            m = wide(mass[i])
+            arm = widened((base[i] - origin) + u[i]) - center
+            momentum += m * wp.cross(arm, widened(p[i]) - mean)
+            square += m * wp.length_sq(arm)
+            outer += m * wp.outer(arm, arm)
+        momentum = of_block(momentum)
+        square = number_of_block(square)
+        outer = wp.tile_extract(wp.tile_sum(wp.tile(outer, preserve_type=True)), 0)
+        turn = wp.vec3d()
+        if number > 0:
             # a little more than the inertia, for bodies on a line
             turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * momentum
             if not (wp.length(turn) < wide(MOST_TURN)):
                 turn = wp.vec3d()
-        center_out[b] = widened(origin) + center
-        turn_out[b] = turn
+        if lane == 0:
+            center_out[b] = widened(origin) + center
+            turn_out[b] = turn
 
     @wp.func
     def curved(arm: wp.vec3d, turn: wp.vec3d) -> vec3:
@@ -302,12 +323,15 @@ def kernels(real: Real) -> SimpleNamespace:
         fraction: wp.array(dtype=scalar),
         least_out: wp.array(dtype=scalar),
     ):
-        b = first + wp.tid()
+        worker = first + wp.tid()
+        b = worker // wp.block_dim()
         least = scalar(1.0)
-        for i in range(starts[b], ends[b]):
+        for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
             if free[i] > scalar(0.0):
                 least = wp.min(least, fraction[i])
-        least_out[b] = least
+        least = wp.tile_extract(wp.tile_min(wp.tile(least)), 0)
+        if worker % wp.block_dim() == 0:
+            least_out[b] = least
 
     @wp.kernel(module=module)
     def spread_least(
@@ -734,7 +758,7 @@ class Newton:
         device.when(self.solver.indefinite, self._solve_projected)
         if self.bodies:
             inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p, self.center, self.turn]
-            device.launch(k.find_turn, self.bodies, inputs, grain=SAMPLES)
+            device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial, self.islands.body, self.center, self.turn]
         inputs += [w.script.target, w.script.mover, w.script.drive]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
@@ -820,7 +844,7 @@ class Newton:
         def search() -> None:
             if self.bodies:
                 inputs = [self.starts, self.ends, model.free, t.first_fraction, self.least]
-                device.launch(k.least_fraction, self.bodies, inputs, grain=1000)
+                device.launch_blocks(k.least_fraction, self.bodies, inputs, grain=1000)
                 device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
             which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
             motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
