@@ -192,7 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--small", action="store_true", help="few and small cases")
     parser.add_argument("-o", "--output", type=Path, default=REPOSITORY / "results" / "gpu", help="absent: results/gpu")
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some parts: {', '.join(PARTS)}")
-    parser.add_argument("--case", default="", help="only the cases whose name contains this")
+    parser.add_argument("--case", default="", help='only the cases whose name contains this, or one of these: "this|that"')
     parser.add_argument("--seconds", type=float, default=BUDGET, help=f"absent: {BUDGET}")
     parser.add_argument("--limit", type=float, help="most seconds a case; absent: as each part says")
     parser.add_argument(
@@ -225,7 +225,7 @@ def main(arguments: list[str] | None = None) -> int:
     lines.unlink(missing_ok=True)
     for name in options.only or PARTS:
         part, left = PARTS[name], options.seconds - (time.perf_counter() - begun)
-        cases = [case for case in part.cases(options.small) if options.case in case]
+        cases = [case for case in part.cases(options.small) if checks.chosen(options.case, case)]
         jobs = min(options.jobs, len(cases)) if part.together else 1
         print(f"{name}: {len(cases)} cases  [{left:.0f} s left]", flush=True)
         with ThreadPoolExecutor(max(1, jobs)) as pool:

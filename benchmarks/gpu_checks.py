@@ -307,8 +307,13 @@ class Kept:
         return self.arrays[name] if name in self.arrays else np.asarray(compute())
 
 
-def prepare(folder: Path, arch: int | None, small: bool, chosen: str) -> None:
-    """Writes the references of all cases whose name contains `chosen`, and compiles the kernels for a CUDA architecture.
+def chosen(parts: str, case: str) -> bool:
+    """Whether the name of a case contains one of the parts, "this|that"."""
+    return any(part in case for part in parts.split("|"))
+
+
+def prepare(folder: Path, arch: int | None, small: bool, parts: str) -> None:
+    """Writes the references of all cases that `chosen` takes, and compiles the kernels for a CUDA architecture.
 
     States that were written before are begun from again: they need not come from the same code.
     """
@@ -316,7 +321,7 @@ def prepare(folder: Path, arch: int | None, small: bool, chosen: str) -> None:
     path = folder / "references.npz"
     found: dict[str, np.ndarray] = dict(np.load(path)) if path.exists() else {}
     for case in scene_cases(small):
-        if chosen not in case:
+        if not chosen(parts, case):
             continue
         start, name = time.perf_counter(), case.partition(" ")[0].rstrip(",")
         try:

@@ -5,8 +5,8 @@ import pytest
 import scipy.linalg
 import warp as wp
 from device.emulated import Emulated
-from linear.test_blocks import NO, YES, assembled, contact_matrix, crowded, elastic, on_free
 
+from linear.test_blocks import NO, YES, assembled, contact_matrix, crowded, elastic, on_free
 from pdipc.linear import wide_modes
 from pdipc.linear.rigid_modes import RigidModes
 from pdipc.linear.wide_modes import WideModes

@@ -24,7 +24,7 @@ from typing import Any
 
 import warp as wp
 
-from pdipc.device import system
+from pdipc.device import blocks, system
 from pdipc.device import threads as shared
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
@@ -312,6 +312,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
     scalar = real.scalar
     module = real.module(__name__)
     block = wp.constant(REDUCE_BLOCK)
+    block_total, block_largest = blocks.total(scalar), blocks.largest(scalar)
 
     @wp.kernel(module=module)
     def sum_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
@@ -322,9 +323,9 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         partial_out[b] = total
 
     @wp.kernel(module=module)
-    def sum_partials(first: int, partial: wp.array(dtype=scalar), blocks: int, out: wp.array(dtype=scalar), slot: int):
+    def sum_partials(first: int, partial: wp.array(dtype=scalar), slots: int, out: wp.array(dtype=scalar), slot: int):
         total = scalar(0.0)
-        for b in range(blocks):
+        for b in range(slots):
             total += partial[b]
         out[slot] = total
 
@@ -337,9 +338,9 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         partial_out[b] = largest
 
     @wp.kernel(module=module)
-    def max_partials(first: int, partial: wp.array(dtype=scalar), blocks: int, out: wp.array(dtype=scalar), slot: int):
+    def max_partials(first: int, partial: wp.array(dtype=scalar), slots: int, out: wp.array(dtype=scalar), slot: int):
         largest = partial[0]
-        for b in range(blocks):
+        for b in range(slots):
             largest = wp.max(largest, partial[b])
         out[slot] = largest
 
@@ -350,7 +351,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         total = scalar(0.0)
         for i in range(worker, count, stride):
             total += values[i]
-        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+        total = block_total(total)
         if worker % wp.block_dim() == 0:
             out[slot + worker // wp.block_dim()] = total
 
@@ -360,7 +361,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         largest = values[0]
         for i in range(worker, count, stride):
             largest = wp.max(largest, values[i])
-        largest = wp.tile_extract(wp.tile_max(wp.tile(largest)), 0)
+        largest = block_largest(largest)
         if worker % wp.block_dim() == 0:
             out[slot + worker // wp.block_dim()] = largest
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from pdipc.device import blocks
 from pdipc.device.launch import BLOCK, Device
 
 
@@ -14,6 +15,7 @@ from pdipc.device.launch import BLOCK, Device
 def kernels() -> SimpleNamespace:
     module = wp.get_module(__name__)
     module.options["enable_backward"] = False
+    block_total = blocks.total(wp.float64)
 
     @wp.kernel(module=module)
     def add_blocks(
@@ -29,7 +31,7 @@ def kernels() -> SimpleNamespace:
         total = wp.float64(0.0)
         for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
             total += values[i]
-        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+        total = block_total(total)
         if worker % wp.block_dim() == 0:
             partial_out[offset + b] = total
 
@@ -37,7 +39,7 @@ def kernels() -> SimpleNamespace:
     def add_bodies(
         first: int,
         offsets: wp.array(dtype=wp.int32),
-        blocks: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
         partial: wp.array(dtype=wp.float64),
         total_out: wp.array(dtype=wp.float64),
     ):
@@ -45,8 +47,8 @@ def kernels() -> SimpleNamespace:
         body = worker // wp.block_dim()
         total = wp.float64(0.0)
         for k in range(offsets[body] + worker % wp.block_dim(), offsets[body + 1], wp.block_dim()):
-            total += partial[blocks[k]]
-        total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+            total += partial[listed[k]]
+        total = block_total(total)
         if worker % wp.block_dim() == 0:
             total_out[body] = total
 

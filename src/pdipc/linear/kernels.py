@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from pdipc.device import blocks
 from pdipc.device.launch import BLOCK, Device
 from pdipc.device.precision import Real
 from pdipc.linear import rows
@@ -65,6 +66,7 @@ def functions(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     row_product, row_difference = rows.functions(real).row_product, rows.functions(real).row_difference
     hidden_part = HIDDEN * real.unit_roundoff
+    block_total = blocks.total(scalar)
 
     @wp.func
     def precondition(i: int, inverse: wp.array(dtype=scalar), inverse_block: wp.array(dtype=mat33), r: vec3):
@@ -97,7 +99,9 @@ def functions(real: Real) -> SimpleNamespace:
     @wp.func
     def store_sum(total: scalar, worker: int, partial_out: wp.array(dtype=scalar)):
         """Adds `total` up over the block of threads and stores it in the block's slot."""
-        wp.tile_store(partial_out, wp.tile_sum(wp.tile(total)), offset=worker // wp.block_dim())
+        all_of_block = block_total(total)
+        if worker % wp.block_dim() == 0:
+            partial_out[worker // wp.block_dim()] = all_of_block
 
     @wp.func_native(_SUM_SLOTS.replace("SCALAR", f"wp::{real.name}"))
     def sum_slots(partial: wp.array(dtype=scalar), count: int, lane: int, step: int) -> scalar: ...
@@ -105,8 +109,7 @@ def functions(real: Real) -> SimpleNamespace:
     @wp.func
     def sum_partials(partial: wp.array(dtype=scalar), count: int, lane: int):
         """Sum of `count` numbers, by one thread or one block of threads; every thread gets it."""
-        total = wp.tile_sum(wp.tile(sum_slots(partial, count, lane, wp.block_dim())))
-        return wp.tile_extract(total, 0)
+        return block_total(sum_slots(partial, count, lane, wp.block_dim()))
 
     @wp.func
     def begin_status(

@@ -16,6 +16,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse import csgraph
 
+from pdipc.device import blocks
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact
@@ -61,12 +62,7 @@ class Translations:
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
-    invert = shared.functions(real).invert
-
-    @wp.func
-    def of_block(value: scalar) -> scalar:
-        """The sum over the threads of a block, for each of them."""
-        return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+    invert, of_block = shared.functions(real).invert, blocks.total(scalar)
 
     @wp.kernel(module=module)
     def find(

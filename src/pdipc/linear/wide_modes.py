@@ -10,6 +10,7 @@ each from one copy of C into the other: nothing depends on the order of threads,
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device import blocks
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device, Span
 from pdipc.device.precision import Real
 from pdipc.linear.blocks import BlockMatrix
@@ -34,7 +36,7 @@ class WideModes(RigidModes):
         starts, label = self.starts.numpy()[: self.groups + 1], self.label.numpy()[: matrix.count]
         total = int(starts[-1]) if self.groups else 0
         share = BLOCK * max(1, -(-total // (BLOCK * WIDE_BLOCKS)))
-        cuts = [np.arange(low, high, share) for low, high in zip(starts[:-1], starts[1:], strict=True)]
+        cuts = [np.arange(low, high, share) for low, high in itertools.pairwise(starts)]
         begin = np.concatenate([*cuts, starts[-1:]])
         owner = np.repeat(np.arange(self.groups), [len(cut) for cut in cuts])
         self.chunks = len(owner)
@@ -98,6 +100,7 @@ def functions(real: Real) -> SimpleNamespace:
     vec3, mat33 = real.vec3, real.mat33
     wide, wide33 = wp.float64, wp.mat33d
     vec6 = wp.types.vector(MODES, wide)
+    of_block, block_sum = blocks.total(wide33), blocks.total(vec6)
 
     @wp.func
     def widened(a: mat33) -> wide33:
@@ -114,15 +117,6 @@ def functions(real: Real) -> SimpleNamespace:
         y = wide(a[1])
         z = wide(a[2])
         return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
-
-    @wp.func
-    def of_block(value: wide33) -> wide33:
-        """The sum over the threads of a block, for each of them."""
-        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
-
-    @wp.func
-    def block_sum(value: vec6) -> vec6:
-        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
 
     @wp.func
     def part(i: int, j: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33) -> wide:
@@ -170,13 +164,10 @@ def kernels(real: Real) -> SimpleNamespace:
     vec6 = f.vec6
     mat66 = wp.types.matrix((MODES, MODES), wide)
     lost = wp.constant(wide(LOST))
+    total_of, total_number = blocks.total(vec3), blocks.total(scalar)
     from pdipc.linear import rigid_modes
 
     mode = rigid_modes.functions(real).mode
-
-    @wp.func
-    def total_of(value: vec3) -> vec3:
-        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
 
     @wp.kernel(module=module)
     def center(
@@ -199,7 +190,7 @@ def kernels(real: Real) -> SimpleNamespace:
         square = scalar(0.0)
         for k in range(begin, end, wp.block_dim()):
             square += wp.length_sq((x[members[k]] - origin) - middle)
-        square = wp.tile_extract(wp.tile_sum(wp.tile(square)), 0)
+        square = total_number(square)
         scale = scalar(1.0)
         if square > scalar(0.0):
             scale = scalar(1.0) / wp.sqrt(square / number)
@@ -316,34 +307,34 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.func
     def solve_pivot(pivot: int, size: int, leading: wp.array(dtype=wide), c: wp.array(dtype=wide), a: vec6) -> vec6:
         """C_kk^-1 a by L D L^T; a pivot that rounding has lost is infinite."""
-        l = mat66()
+        lower = mat66()
         d = vec6()
         inverse = vec6()
         at = MODES * pivot
         for j in range(MODES):
             own = c[(at + j) * size + at + j]
             for m in range(j):
-                own -= l[j, m] * l[j, m] * d[m]
+                own -= lower[j, m] * lower[j, m] * d[m]
             if own > lost * leading[at + j]:
                 d[j] = own
                 inverse[j] = wide(1.0) / own
             for i in range(j + 1, MODES):
                 below = c[(at + i) * size + at + j]
                 for m in range(j):
-                    below -= l[i, m] * l[j, m] * d[m]
-                l[i, j] = below * inverse[j]
+                    below -= lower[i, m] * lower[j, m] * d[m]
+                lower[i, j] = below * inverse[j]
         w = vec6()
         for i in range(MODES):
             own = a[i]
             for m in range(i):
-                own -= l[i, m] * w[m]
+                own -= lower[i, m] * w[m]
             w[i] = own
         w = wp.cw_mul(w, inverse)
         for back in range(MODES):
             i = MODES - 1 - back
             own = w[i]
             for m in range(i + 1, MODES):
-                own -= l[m, i] * w[m]
+                own -= lower[m, i] * w[m]
             w[i] = own
         return w
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from pdipc.device import blocks
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
@@ -130,7 +131,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
     module = real.module(__name__)
     f, of_modes = shared.functions(real), mode_functions(real)
     mode, vec6, block_sum = rigid_modes.functions(real).mode, of_modes.vec6, of_modes.block_sum
-    modes = rigid_modes.MODES
+    modes, block_total = rigid_modes.MODES, blocks.total(scalar)
     First, Second = first_kind.Operand, second_kind.Operand
     feel_first, feel_second = first_kind.feel, second_kind.feel
     exert_first, exert_second = first_kind.exert, second_kind.exert
@@ -185,7 +186,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             if kinds > 1:
                 for k in range(begin, b.count[0], step):
                     delta += feel_second(b, k, u)
-        delta = wp.tile_extract(wp.tile_sum(wp.tile(delta)), 0)
+        delta = block_total(delta)
         if worker % wp.block_dim() == 0:
             delta_out[block] = delta
 
@@ -324,7 +325,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             corrected = inverse[i] * residual + shift + wp.cross(turned, arms[i])
             u_out[i] = corrected
             gamma += wp.dot(residual, corrected)
-        gamma = wp.tile_extract(wp.tile_sum(wp.tile(gamma)), 0)
+        gamma = block_total(gamma)
         if lane == 0:
             gamma_out[chunk] = gamma
 

@@ -33,6 +33,7 @@ from pdipc.barrier.friction import FrictionTerm
 from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.collision.islands import Islands
+from pdipc.device import blocks
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
@@ -70,6 +71,8 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     wide = wp.float64
     slack = wp.constant(wp.float64(SLACK[real.name]))
+    total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
+    least_number = blocks.least(scalar)
 
     @wp.func
     def wide_square(a: vec3, b: vec3) -> wide:
@@ -137,15 +140,6 @@ def kernels(real: Real) -> SimpleNamespace:
         """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
         return (k * count) / number + (k * 37) % (count / number)
 
-    @wp.func
-    def of_block(value: wp.vec3d) -> wp.vec3d:
-        """The sum over a block of threads; the CPU's are of one."""
-        return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
-
-    @wp.func
-    def number_of_block(value: wide) -> wide:
-        return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
-
     @wp.kernel(module=module)
     def find_turn(
         first: int,
@@ -178,9 +172,9 @@ def kernels(real: Real) -> SimpleNamespace:
             total += m
             center += m * widened((base[i] - origin) + u[i])
             mean += m * widened(p[i])
-        total = number_of_block(total)
-        center = of_block(center)
-        mean = of_block(mean)
+        total = total_number(total)
+        center = total_vector(center)
+        mean = total_vector(mean)
         if total > wide(0.0):
             center = center / total
             mean = mean / total
@@ -194,9 +188,9 @@ def kernels(real: Real) -> SimpleNamespace:
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
             outer += m * wp.outer(arm, arm)
-        momentum = of_block(momentum)
-        square = number_of_block(square)
-        outer = wp.tile_extract(wp.tile_sum(wp.tile(outer, preserve_type=True)), 0)
+        momentum = total_vector(momentum)
+        square = total_number(square)
+        outer = total_matrix(outer)
         turn = wp.vec3d()
         if number > 0:
             # a little more than the inertia, for bodies on a line
@@ -329,7 +323,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
             if free[i] > scalar(0.0):
                 least = wp.min(least, fraction[i])
-        least = wp.tile_extract(wp.tile_min(wp.tile(least)), 0)
+        least = least_number(least)
         if worker % wp.block_dim() == 0:
             least_out[b] = least
 
