@@ -183,6 +183,9 @@ class Cavities:
     def couple(self, modes) -> None:
         """Nothing: see `diagonal`."""
 
+    def operand(self) -> None:
+        """None: there is `apply`."""
+
 
 def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
     """None: the kernels take the arrays of `Cavities`, which the projector makes."""

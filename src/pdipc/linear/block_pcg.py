@@ -6,7 +6,7 @@ fallen to a part of the first one, or to what a tolerated motion of one vertex c
 
 import functools
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -32,6 +32,10 @@ class Coupling(Protocol):
 
     def couple(self, modes: RigidModes) -> None:
         """Launches what the Hessian adds to the matrix of the rigid modes."""
+        ...
+
+    def operand(self) -> Any:
+        """What its `wide_pcg.Operator` works on; None where there is only `apply`."""
         ...
 
 

@@ -74,9 +74,6 @@ class WideModes(RigidModes):
         matrix = [m.offsets, m.columns, m.values, m.held]
         device.launch_blocks(k.gather, groups**2, [*layout, *matrix, self.c, self.near])
         for contact in contacts:
-            inputs = [contact.count, contact.quads, self.label, groups, self.near]
-            device.launch_list(k.mark, contact.capacity, inputs)
-        for contact in contacts:
             contact.couple(self)
         device.launch(k.lead, MODES * groups, [MODES * groups, self.c, self._lead])
         here, there = self.c, self._other
@@ -84,8 +81,9 @@ class WideModes(RigidModes):
             device.launch(k.eliminate, MODES * groups**2, [groups, pivot, self._lead, here, there])
             here, there = there, here
 
-    def couple(self, kernel: wp.Kernel, inputs: list) -> None:
-        """Launches a kernel of `coupling` over all pairs of groups."""
+    def couple(self, kernel: wp.Kernel, count: wp.array, capacity: int, inputs: list) -> None:
+        """Launches a kernel of `coupling` over all pairs of groups that pairs in contact connect: `count` of them, in inputs[2]."""
+        self.device.launch_list(self._wide.mark, capacity, [count, inputs[2], self.label, self.groups, self.near])
         layout = [self.starts, self.members, self.label, self.groups, self.arms, self.near]
         self.device.launch_blocks(kernel, self.groups**2, [*layout, *inputs, self.c])
 

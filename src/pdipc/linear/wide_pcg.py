@@ -3,7 +3,7 @@
 The numbers of an iteration are sums over all vertices, and a launch is where threads wait for each other. So there are as many as there
 are dependences,
 
-    multiply    w = K u without contacts, what each pair of contacts feels under u, delta = u . K u
+    multiply    w = K u without contacts (other couplings have launches of their own before, and have put their parts into w), what each pair of contacts feels under u, delta = u . K u
     advance     gamma, delta -> beta, alpha; contacts' part of w; p, s, x, r one step on; Z^T r by chunks of vertices
     correct     u = D^-1 r + Z C^-1 Z^T r, gamma = r . u
 
@@ -80,7 +80,7 @@ class WidePcg(BlockPcg):
         self,
         p: wp.array,
         b: wp.array,
-        contacts: list[Coupling],
+        couplings: list[Coupling],
         tolerated: float,
         loose: wp.array,
         tolerance: float | None = None,
@@ -89,7 +89,7 @@ class WidePcg(BlockPcg):
         rows = [m.offsets, m.columns, m.values, m.held]
         tolerance = self.real.scalar(tolerance or self.tolerance)
         device.launch(k.clear, m.count, [self._w])
-        for c in contacts:
+        for c in couplings:
             c.apply(p, self._w)
         device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
         if not modes.chunks:
@@ -104,9 +104,12 @@ class WidePcg(BlockPcg):
         device.launch_blocks(k.begin, 1, [*numbers, *limits, *status, self.indefinite])
         device.launch(wide.begin, 1, [self._going, self._left, self._flags])
 
-        operands = [c.operand() for c in contacts] + [o.Operand() for o in self._operators[len(contacts) :]]
+        operands = [o for c in couplings if (o := c.operand()) is not None]
+        others = [c for c in couplings if c.operand() is None]
+        kinds, beside = len(operands), int(len(others) > 0)
+        operands += [o.Operand() for o in self._operators[kinds:]]
         slots = self._row_blocks + PAIR_BLOCKS
-        product = [modes.members, self._vertices, self._row_blocks, PAIR_BLOCKS, *rows, self._u, len(contacts), *operands]
+        product = [modes.members, self._vertices, self._row_blocks, PAIR_BLOCKS, *rows, self._u, kinds, *operands, beside]
         vectors = [self._w, self._u, self._p, self._s, p, self._r]
         chunks = [modes.chunk_starts, modes.members, modes.arms]
         sums = [self._gamma, modes.chunks, self._delta, slots]
@@ -115,9 +118,11 @@ class WidePcg(BlockPcg):
         def iterate() -> None:
             for turn in range(TURN):
                 old, new = turn % 2, 1 - turn % 2
+                for c in others:
+                    c.apply(self._u, self._w)
                 device.launch_blocks(wide.multiply, slots, [self._flags, old, *product, self._w, self._delta])
                 state = [self._flags, self._pair, old, new]
-                both = [len(contacts), *operands]
+                both = [kinds, *operands, beside]
                 device.launch_blocks(wide.advance, modes.chunks, [*state, *sums, *told, *chunks, *both, *vectors, modes.sums])
                 device.launch_blocks(wide.correct, modes.chunks, [self._flags, new, *correction])
 
@@ -162,7 +167,8 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         kinds: int,
         a: First,
         b: Second,
-        w_out: wp.array(dtype=vec3),
+        beside: int,
+        w: wp.array(dtype=vec3),
         delta_out: wp.array(dtype=scalar),
     ):
         """Some blocks of threads have rows of the matrix, the others have pairs."""
@@ -175,7 +181,9 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             for m in range(worker, vertices, row_blocks * wp.block_dim()):
                 i = members[m]
                 product = row_product(i, offsets, columns, values, held, u)
-                w_out[i] = product
+                if beside != 0:
+                    product += w[i]
+                w[i] = product
                 delta += wp.dot(u[i], product)
         else:
             begin = worker - row_blocks * wp.block_dim()
@@ -213,6 +221,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         kinds: int,
         a: First,
         b: Second,
+        beside: int,
         w: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -267,6 +276,8 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         for m in range(chunk_starts[chunk] + lane, chunk_starts[chunk + 1], wp.block_dim()):
             i = members[m]
             whole = w[i]
+            if beside != 0:
+                w[i] = vec3()
             if kinds > 0:
                 whole += exert_first(a, i)
             if kinds > 1:
