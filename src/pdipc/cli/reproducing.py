@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,6 +44,13 @@ def reproduce(
     ],
     small: Annotated[bool, typer.Option("--small", help="A few minutes' version.")] = False,
     out: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="Default: reproduced/<name>.")] = None,
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="ROW,ROW", help="Of a table: these rows only, such as dragon,skirt.")
+    ] = None,
+    mode: Annotated[
+        str | None, typer.Option("--mode", metavar="MODE", help="Of a table: default, paper or both.", show_default=False)
+    ] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of a table: steps of each row.")] = None,
     listed: Annotated[
         bool, typer.Option("--list", callback=_list, is_eager=True, help="Tell which there are, and what they show.")
     ] = False,
@@ -52,4 +60,11 @@ def reproduce(
     if name not in known:
         raise typer.BadParameter(f'"{name}"; there are: {", ".join(known)}', param_hint="NAME")
     outside_of_runs(out)
-    importlib.import_module(f"pdipc.reproduce.{name}").run(out or Path("reproduced") / name, small)
+    if mode not in (None, "default", "paper", "both"):
+        raise typer.BadParameter(f'"{mode}"; it must be default, paper or both', param_hint="--mode")
+    run = importlib.import_module(f"pdipc.reproduce.{name}").run
+    named = None if rows is None else [row.strip() for row in rows.split(",")]
+    given = {key: value for key, value in (("rows", named), ("mode", mode), ("steps", steps)) if value is not None}
+    if useless := sorted(given.keys() - inspect.signature(run).parameters.keys()):
+        raise typer.BadParameter(f"{name} has none; it is for tables, such as table1", param_hint=f"--{useless[0]}")
+    run(out or Path("reproduced") / name, small, **given)

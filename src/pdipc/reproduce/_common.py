@@ -4,6 +4,7 @@ import csv
 import importlib
 import json
 import os
+import platform
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from types import ModuleType
 
 import numpy as np
 
+from pdipc.device.launch import Device
 from pdipc.judge.witness import find_intersections
 from pdipc.output.render import drawing, settings_of
 from pdipc.output.results import Run, RunWriter, open_run
@@ -48,13 +50,17 @@ def baseline(name: str) -> ModuleType:
 # --- runs ---
 
 
-def simulated(scene: Scene, folder: Path, label: str, device: str | None = None) -> Run:
-    """The run of `scene` in `folder`. One of the same scene that was stopped goes on; one that is complete is only read."""
+def simulated(scene: Scene, folder: Path, label: str, device: str | None = None, steps: int | None = None) -> Run:
+    """The run of `scene` in `folder`. One of the same scene that was stopped goes on; one that is complete is only read.
+
+    steps: in place of the scene's.
+    """
     resume = _begun(scene, folder)
-    with progress(label, scene.simulation.steps) as advance:
+    with progress(label, scene.simulation.steps if steps is None else steps) as advance:
         run_scene(
             scene,
             folder,
+            steps=steps,
             device=device,
             resume=resume,
             overwrite=not resume,
@@ -117,16 +123,29 @@ def progress(label: str, total: int) -> Iterator[Callable[[int, str], None]]:
 # --- what is written ---
 
 
+def machine(device: Device) -> str:
+    """The machine, for captions."""
+    if device.is_cuda:
+        return device.warp.name
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {device.threads} threads"
+
+
 def pictures(
     run: Run,
     frames: Iterable[int],
     size: tuple[int, int],
-    view: tuple[float, float, float],
+    view: tuple[float, float, float] | None = None,
     framed: Iterable[int] | None = None,
 ) -> list[np.ndarray]:
-    """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`)."""
+    """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`).
+
+    view: absent, that of the scene.
+    """
     frames = list(frames)
-    settings = settings_of(run).model_copy(update={"size": size, "view": view})
+    settings = settings_of(run).model_copy(update={"size": size} | ({"view": view} if view else {}))
     with drawing(run, list(framed or frames), settings) as drawn:
         return [drawn.image(frame) for frame in frames]
 

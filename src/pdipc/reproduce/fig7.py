@@ -1,7 +1,6 @@
 """Figure 7: convergence of the global solve for a square table cloth, under gravity and at a sharp local force."""
 
 import csv
-import platform
 import time
 from pathlib import Path
 
@@ -131,19 +130,6 @@ def curve(
     return points
 
 
-def describe(device: Device) -> str:
-    """The machine, for captions."""
-    if device.is_cuda:
-        return device.warp.name
-    info = Path("/proc/cpuinfo")
-    names = (
-        [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        if info.exists()
-        else []
-    )
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {device.threads} threads"
-
-
 def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> Path:
     """Writes fig7.csv, fig7.txt and fig7.png to `out_dir`; small: a cloth of 14 x 14 vertices instead of 100 x 100. Returns the PNG."""
     import matplotlib
@@ -176,7 +162,7 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     for axis in axes.ravel():
         axis.grid(alpha=0.3)
     axes[0, 1].legend(fontsize=7)
-    figure.suptitle(f"Global solve of a table cloth, {3 * system.count} DOF, {system.real.name}, {describe(place)}")
+    figure.suptitle(f"Global solve of a table cloth, {3 * system.count} DOF, {system.real.name}, {_common.machine(place)}")
     figure.savefig(out / "fig7.png", dpi=110)
     plt.close(figure)
     with (out / "fig7.csv").open("w", newline="") as file:
@@ -196,6 +182,6 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     )
     sentence = (
         "Paper, Fig. 7: A-Jacobi of order 3 converges in fewer iterations than Jacobi, Gauss-Seidel and SOR, like PCG, and fastest on a GPU. "
-        f"Here ({describe(place)}), to a relative error of 1e-3: {told}."
+        f"Here ({_common.machine(place)}), to a relative error of 1e-3: {told}."
     )
     return _common.conclude(out / "fig7.png", sentence)

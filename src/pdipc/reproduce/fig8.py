@@ -8,7 +8,7 @@ import numpy as np
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real, real
 from pdipc.reproduce import _common
-from pdipc.reproduce.fig7 import Run, describe, loads, table_cloth
+from pdipc.reproduce.fig7 import Run, loads, table_cloth
 
 # An iteration of order l expands the series by l terms. The first variant is what the others are measured by.
 VARIANTS = {
@@ -63,7 +63,7 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     best = max(rows, key=lambda row: row[3])
     sentence = (
         "Paper, Fig. 8: on a GPU order 3 expands the series of Eq. (10) up to 2.8 times as fast as Jacobi, less for larger problems. "
-        f"Here ({describe(place)}): at most {best[3]:.2f} times as fast, by {best[1]} at {best[0]:,} degrees of freedom."
+        f"Here ({_common.machine(place)}): at most {best[3]:.2f} times as fast, by {best[1]} at {best[0]:,} degrees of freedom."
     )
     return _common.conclude(out / "fig8.png", sentence)
 
@@ -83,7 +83,7 @@ def _draw(rows: list[tuple], place: Device, precision: str):
         axis.bar_label(bars, fmt="%.0f", fontsize=7)
     axis.set_xticks(range(len(sizes)), [f"{size:,} DOF" for size in sizes])
     axis.set_ylabel("terms of the series per second,\n% of Jacobi")
-    axis.set_title(f"A-Jacobi over problem sizes, {precision}, {describe(place)}")
+    axis.set_title(f"A-Jacobi over problem sizes, {precision}, {_common.machine(place)}")
     figure.legend(loc="outside lower center", ncols=len(VARIANTS) // 2, fontsize=8)
     axis.grid(axis="y", alpha=0.3)
     return figure

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from pdipc.scene import figures
 from pdipc.scene.meshes import Mesh
 from pdipc.scene.tables import Real, Table, Whole
 
@@ -304,7 +305,6 @@ class Knot(Shape):
 
 
 LINES = (Rope, Ring, Coil, Knot)
-SHAPES = (Box, Sphere, Cylinder, Capsule, Torus, Bowl, Stairs, Grid, Plane, *LINES)
 
 
 def _evenly(curve: np.ndarray, segments: int) -> np.ndarray:
@@ -312,6 +312,80 @@ def _evenly(curve: np.ndarray, segments: int) -> np.ndarray:
     passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0.0, passed[-1], segments + 1)
     return np.column_stack([np.interp(at, passed, curve[:, axis]) for axis in range(3)])
+
+
+class Skirt(Shape):
+    """Layers of cloth around y, open above and below, that widen downward in waves; the origin is the middle of the waist.
+
+    The innermost layer is the longest; each further one starts `gap` outside of it and is shorter by an equal part.
+    """
+
+    shape: Literal["skirt"] = "skirt"
+    waist: Length = Field(default=0.1, description="Radius at the top of the innermost layer, m.")
+    hem: Length = Field(default=0.25, description="Mean radius at its lower end, m; larger than waist.")
+    length: Length = Field(default=0.3, description="Of the innermost layer, along y, m.")
+    layers: Annotated[Whole, Field(ge=1, le=10)] = Field(default=3, description="Number of layers.")
+    gap: Length = Field(default=0.01, description="Between layers at the waist, m; twice as much at the hem.")
+    waves: Annotated[Whole, Field(ge=0, le=100)] = Field(
+        default=8, description="Folds around; the cells around should be six times as many."
+    )
+    cells: tuple[Annotated[Whole, Field(ge=3, le=4096)], Count] = Field(
+        default=(64, 16), description="Cells around, and down the innermost layer; each is cut into two triangles."
+    )
+
+    def model_post_init(self, _) -> None:
+        if self.waist >= self.hem:
+            raise ValueError(f"hem {self.hem} must be larger than waist {self.waist}")
+
+    def cell_count(self) -> int:
+        return self.layers * math.prod(self.cells)
+
+    def bytes(self) -> int:
+        return self.cell_count() * 250
+
+    def mesh(self) -> Mesh:
+        around, down = self.cells
+        vertices, triangles = [], []
+        for layer in range(self.layers):
+            rows = max(1, round(down * (self.layers - layer) / self.layers))
+            part, angle = np.meshgrid(np.arange(rows + 1) / down, 2 * np.pi * np.arange(around) / around, indexing="ij")
+            part, angle = part.ravel(), angle.ravel()
+            wave = 0.15 * np.cos(self.waves * angle) if self.waves else 0.0
+            radius = self.waist + (self.hem - self.waist) * part * (1 + wave)
+            radius += layer * self.gap * (1 + part)
+            own = np.column_stack([radius * np.cos(angle), -self.length * part, radius * np.sin(angle)])
+            i, j = (index.ravel() for index in np.indices((rows, around)))
+            a, b = i * around + j, i * around + (j + 1) % around
+            c, d = a + around, b + around
+            turned = ((i + j) % 2 == 1)[:, None]
+            first = np.where(turned, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+            second = np.where(turned, np.stack([b, d, c], axis=1), np.stack([a, d, c], axis=1))
+            triangles.append(sum(map(len, vertices)) + np.concatenate([first, second]))
+            vertices.append(own)
+        return Mesh(np.concatenate(vertices), np.concatenate(triangles).astype(np.int32))
+
+
+class Figure(Shape):
+    """An animal or a thing of round parts, its bounding box centred at the origin; y is up, and it faces +z."""
+
+    shape: Literal["figure"] = "figure"
+    name: Literal[tuple(figures.FIGURES)] = Field(description="Which.")  # type: ignore[valid-type]
+    size: Length = Field(default=1.0, description="Largest extent, m.")
+    cells: Annotated[Whole, Field(ge=6, le=400)] = Field(
+        default=24, description="Cells of the lattice across the largest extent; parts thinner than a cell are lost."
+    )
+
+    def cell_count(self) -> int:
+        return self.cells**3
+
+    def bytes(self) -> int:
+        return self.cells**3 * 1500
+
+    def mesh(self) -> Mesh:
+        return figures.mesh(self.name, self.size, self.cells)
+
+
+SHAPES = (Box, Sphere, Cylinder, Capsule, Torus, Bowl, Stairs, Grid, Plane, *LINES, Skirt, Figure)
 
 
 def lattice(cells: tuple[int, int, int], ring: bool = False) -> tuple[np.ndarray, np.ndarray]:

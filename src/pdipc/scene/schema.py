@@ -314,7 +314,9 @@ MeshSource = Annotated[
     | Annotated[generators.Rope, Tag("rope")]
     | Annotated[generators.Ring, Tag("ring")]
     | Annotated[generators.Coil, Tag("coil")]
-    | Annotated[generators.Knot, Tag("knot")],
+    | Annotated[generators.Knot, Tag("knot")]
+    | Annotated[generators.Skirt, Tag("skirt")]
+    | Annotated[generators.Figure, Tag("figure")],
     Discriminator(
         _mesh_kind,
         custom_error_type="mesh",

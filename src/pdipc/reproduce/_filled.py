@@ -1,0 +1,80 @@
+"""Surfaces of the optional data as solids: remeshed and filled with tets by their winding number, once, and kept.
+
+What is inside is told by the generalized winding number (Jacobson et al. 2013), so holes, edges that more than two triangles
+share, and parts that overlap need no repair; `pdipc.scene.stuffing` makes the tets.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from pdipc.device.system import start_warp
+from pdipc.scene.stuffing import stuffed
+
+VERSION = b"1"  # of what is kept
+CLOSE = 0.02  # parts of the number of elements asked for
+TRIES = 8
+DENSE = 2.7  # elements grow about with this power of the lattice's resolution
+
+
+def cache() -> Path:
+    """Where solids are kept: the folder PDIPC_CACHE, else pdipc in the user's folder for caches."""
+    named = os.environ.get("PDIPC_CACHE")
+    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "pdipc"
+
+
+def filled(vertices: np.ndarray, triangles: np.ndarray, elements: int, label: str) -> dict[str, np.ndarray]:
+    """A mesh table of a scene, of about so many tets: what the triangles (m, 3) of the vertices (n, 3) enclose."""
+    vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int32)
+    digest = hashlib.sha256(VERSION + vertices.tobytes() + triangles.tobytes() + str(elements).encode()).hexdigest()[:24]
+    file = cache() / f"{digest}.npz"
+    if file.is_file():
+        arrays = np.load(file)
+        return {"vertices": arrays["V"], "tets": arrays["T"]}
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    scale = float((high - low).max())
+    level = _enclosed((vertices - low) / scale, triangles)
+    cells = 40.0
+    for _ in range(TRIES):
+        mesh = stuffed(level, np.zeros(3), (high - low) / scale, 1.0 / cells)
+        ratio = elements / len(mesh.tets)
+        if abs(ratio - 1.0) < CLOSE:
+            break
+        cells *= ratio ** (1.0 / DENSE)
+    print(f"{label}: {len(triangles)} triangles filled with {len(mesh.tets)} tets, {len(mesh.vertices)} vertices", flush=True)
+    found = {"V": scale * mesh.vertices + low, "T": mesh.tets}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_suffix(f".{os.getpid()}.tmp.npz")
+    np.savez_compressed(temporary, **found)
+    os.replace(temporary, file)
+    return {"vertices": found["V"], "tets": found["T"]}
+
+
+@wp.kernel
+def _distances(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, out: wp.array(dtype=float)):
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach, 2.0, 0.5)
+    out[i] = reach
+    if query.result:
+        near = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        out[i] = query.sign * wp.length(near - points[i])
+
+
+def _enclosed(vertices: np.ndarray, triangles: np.ndarray):
+    """The level set of a surface within the unit box."""
+    start_warp()
+    mesh = wp.Mesh(
+        points=wp.array(vertices, dtype=wp.vec3, device="cpu"),
+        indices=wp.array(triangles.ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=True,
+    )
+
+    def level(x: np.ndarray) -> np.ndarray:
+        points, out = wp.array(x, dtype=wp.vec3, device="cpu"), wp.zeros(len(x), dtype=float, device="cpu")
+        wp.launch(_distances, dim=len(x), inputs=[mesh.id, points, 4.0], outputs=[out], device="cpu")
+        return out.numpy().astype(np.float64)
+
+    return level
