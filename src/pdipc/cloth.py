@@ -1,5 +1,7 @@
 """A cloth's part of a model: the constraints of its sheet, of its seams, and of what it holds."""
 
+import dataclasses
+
 import numpy as np
 
 from pdipc import constraints
@@ -10,9 +12,11 @@ from pdipc.constraints import (
     material,
     quadratic_bending,
     stitch,
+    strain_limit,
     triangle_area,
     triangle_strain,
     triangles,
+    woven,
 )
 from pdipc.scene.assembly import AssembledBody, Assembly
 from pdipc.scene.schema import ClothMaterial
@@ -22,23 +26,39 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
     """The constraints of a cloth, and the masses (n,) kg of its vertices among all."""
     x, m = assembly.rest_positions, body.material
     assert isinstance(m, ClothMaterial)
+    shape = body.elastic_shape
+    rest, corners = (x, body.triangles) if shape is None else shape
     sets = []
     if m.membrane == "springs":
         edges, stiffness = material.springs(x, body.triangles, m.membrane_stiffness)
         sets.append(edge_length.rest(x, edges, stiffness))
     else:
         strain, area = material.cloth(m.membrane_stiffness, m.poisson_ratio)
-        sets.append(triangle_strain.rest(x, body.triangles, strain))
+        if m.is_woven:
+            law = material.woven(
+                m.membrane_stiffness, m.weft_stiffness or m.membrane_stiffness, m.shear_stiffness, m.poisson_ratio
+            )
+            sets.append(woven.rest(rest, corners, law, m.warp or (1.0, 0.0, 0.0)))
+            area = 0.0
+        else:
+            sets.append(triangle_strain.rest(rest, corners, strain))
         area += 2.0 * m.area_stiffness  # a change of area of tr(e) costs w / 2 of tr(e)^2 / 2
         if area > 0.0:
-            sets.append(triangle_area.rest(x, body.triangles, area))
-    bending = curved_bending if m.bending == "curved" else quadratic_bending
+            sets.append(triangle_area.rest(rest, corners, area))
+    if m.strain_limit:
+        stiffest = max(m.membrane_stiffness, m.weft_stiffness or 0.0)
+        sets.append(strain_limit.rest(rest, corners, stiffest, m.strain_limit))
+    if shape is not None:  # elements of the pattern act on the vertices that it is sewn to
+        sets = [dataclasses.replace(s, vertices=body.triangles) for s in sets]
     if m.bending_stiffness:
-        sets.append(bending.rest(x, body.triangles, m.bending_stiffness))
+        if m.bending == "curved":
+            sets.append(curved_bending.rest(x, body.triangles, m.bending_stiffness))
+        else:
+            sets.append(quadratic_bending.rest(x, body.triangles, m.bending_stiffness, body.pattern))
     if body.inside is not None:
         outward, cavity, _ = cavities(assembly, body)
         sets.append(enclosed_volume.rest(outward, cavity, np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (len(cavity), 1))))
-    mass = material.lumped_mass(len(x), body.triangles, m.areal_density * triangles.rest_shape(x, body.triangles)[1])
+    mass = material.lumped_mass(len(x), body.triangles, m.areal_density * triangles.rest_shape(rest, corners)[1])
     return sets, mass
 
 

@@ -18,10 +18,12 @@ from pdipc.constraints import (
     rod_frames,
     rod_ghost,
     stitch,
+    strain_limit,
     tet_strain,
     tet_volume,
     triangle_area,
     triangle_strain,
+    woven,
 )
 from pdipc.device.launch import Device
 from pdipc.device.precision import real
@@ -81,6 +83,10 @@ def make(kind, rng):
     x, triangles = sheet(rng, height=0.2 if kind is curved_bending else 0.0)
     if kind is edge_length:
         return x, kind.rest(x, triangles[:, :2], 2.0)
+    if kind is woven:
+        return x, kind.rest(x, triangles, (3.0, 1.0, 0.5, 0.7), (1.0, 0.4, 0.0))
+    if kind is strain_limit:
+        return x, kind.rest(x, triangles, 2.0, 0.3)
     return x, kind.rest(x, triangles, 2.0)
 
 

@@ -26,6 +26,14 @@ def cloth(membrane_stiffness: float, poisson_ratio: float) -> tuple[float, float
     return 2.0 * mu, 2.0 * lame
 
 
+def woven(warp: float, weft: float, shear: float | None, poisson_ratio: float) -> tuple[float, float, float, float]:
+    """C11, C22, C12 and S of `constraints.woven`, N/m: plane stress with nu_12 nu_21 = nu^2 and nu_12 / warp = nu_21 / weft, so that cloth
+    pulled along its warp (weft) is as stiff as that. shear: N/m; None for sqrt(warp weft) / (2 (1 + nu)).
+    """
+    mean, free = float(np.sqrt(warp * weft)), 1.0 - poisson_ratio**2
+    return warp / free, weft / free, poisson_ratio * mean / free, shear or mean / (2.0 * (1.0 + poisson_ratio))
+
+
 def springs(rest_positions: np.ndarray, triangles: np.ndarray, membrane_stiffness: float) -> tuple[np.ndarray, np.ndarray]:
     """Edges (e, 2) of a sheet and their spring constants (e,), N/m, that stretch about as a membrane of Y (Van Gelder 1998).
 

@@ -18,10 +18,12 @@ from pdipc.constraints import (
     rod_frames,
     rod_ghost,
     stitch,
+    strain_limit,
     tet_strain,
     tet_volume,
     triangle_area,
     triangle_strain,
+    woven,
 )
 from pdipc.constraints.base import ConstraintSet, merge
 from pdipc.device.launch import Device, Reducer
@@ -35,6 +37,8 @@ KINDS = (
     neo_hookean,
     triangle_strain,
     triangle_area,
+    woven,
+    strain_limit,
     edge_length,
     quadratic_bending,
     curved_bending,

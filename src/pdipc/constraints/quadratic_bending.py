@@ -36,25 +36,50 @@ def hinges(triangles: np.ndarray) -> np.ndarray:
 
 def curvature_rows(rest_positions: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """g (h, 4) and the areas (h,) of both triangles of each hinge, m^2."""
-    x0, x1, x2, x3 = (rest_positions[vertices[:, c]] for c in range(4))
+    corners = rest_positions[vertices]
+    return _rows_of_sides(corners[:, :3], corners[:, [0, 1, 3]])
 
-    def cotangent(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+
+def _rows_of_sides(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same, from (h, 3, 3) each: the ends of the hinge and the vertex across, as either triangle has them at rest."""
+
+    def cotangents(side: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """At both ends of the hinge, and the area."""
+        e, a, b = side[:, 1] - side[:, 0], side[:, 2] - side[:, 0], side[:, 2] - side[:, 1]
+        double = np.linalg.norm(np.cross(e, a), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.einsum("ij,ij->i", a, b) / np.linalg.norm(np.cross(a, b), axis=1)
+            return np.einsum("ij,ij->i", e, a) / double, np.einsum("ij,ij->i", -e, b) / double, 0.5 * double
 
-    e = x1 - x0
-    c01, c02 = cotangent(e, x2 - x0), cotangent(e, x3 - x0)
-    c03, c04 = cotangent(-e, x2 - x1), cotangent(-e, x3 - x1)
-    g = np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1)
-    area = 0.5 * (np.linalg.norm(np.cross(e, x2 - x0), axis=1) + np.linalg.norm(np.cross(e, x3 - x0), axis=1))
-    return g, area
+    (c01, c03, area), (c02, c04, other) = cotangents(first), cotangents(second)
+    return np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1), area + other
 
 
-def rest(rest_positions: np.ndarray, triangles: np.ndarray, bending_stiffness: float) -> ConstraintSet:
-    """Bending of the sheet `triangles` (m, 3). bending_stiffness: flexural rigidity k, N m. Raises ValueError for slivers."""
+def rest(rest_positions: np.ndarray, triangles: np.ndarray, bending_stiffness: float, corners=None) -> ConstraintSet:
+    """Bending of the sheet `triangles` (m, 3). bending_stiffness: flexural rigidity k, N m. Raises ValueError for slivers.
+
+    corners: (m, 3, 3) the corners of each triangle in a flat shape of its own, from which the sheet is sewn; None for rest_positions.
+    """
     vertices = hinges(triangles)
-    g, area = curvature_rows(rest_positions, vertices)
+    if corners is None:
+        g, area = curvature_rows(rest_positions, vertices)
+    else:
+        g, area = _rows_of_sides(*(_side(triangles, corners, vertices[:, [0, 1, across]]) for across in (2, 3)))
     return make_set(NAME, vertices, g[:, None, :], bending_stiffness / area, length=np.zeros(len(vertices)))
+
+
+def _side(triangles: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """(h, 3, 3): where `vertices` (h, 3), the corners of a triangle in any order, are in `corners`."""
+    keys = np.sort(triangles, axis=1)
+    order = np.lexsort(keys.T[::-1])
+    wanted = np.sort(vertices, axis=1)
+    size = np.int64(triangles.max()) + 1
+
+    def code(rows: np.ndarray) -> np.ndarray:
+        return (rows[:, 0].astype(np.int64) * size + rows[:, 1]) * size + rows[:, 2]
+
+    which = order[np.searchsorted(code(keys)[order], code(wanted))]
+    place = np.argmax(triangles[which][:, None, :] == vertices[:, :, None], axis=2)
+    return corners[which[:, None], place]
 
 
 def functions(real: Real) -> SimpleNamespace:

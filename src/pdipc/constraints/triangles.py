@@ -36,13 +36,34 @@ def rest_shape(rest_positions: np.ndarray, triangles: np.ndarray) -> tuple[np.nd
     return np.linalg.inv(edges), area
 
 
-def make(kind: str, rest_positions: np.ndarray, triangles: np.ndarray, weight_per_area) -> ConstraintSet:
-    """Elements whose weight is `weight_per_area` (N/m, one or one a triangle) times their area."""
+def make(kind: str, rest_positions: np.ndarray, triangles: np.ndarray, weight_per_area, axis=None, **data) -> ConstraintSet:
+    """Elements whose weight is `weight_per_area` (N/m, one or one a triangle) times their area.
+
+    axis: (3,) a direction at rest, which becomes the first of each triangle's two axes; None for its first side. data: further rest data.
+    """
     inverse, area = rest_shape(rest_positions, triangles)
+    if axis is not None:
+        inverse = inverse @ _turned(rest_positions, triangles, np.asarray(axis, dtype=np.float64))
     gradient = np.zeros((len(triangles), 2, 3))
     gradient[:, :, 1:] = np.swapaxes(inverse, 1, 2)
     gradient[:, :, 0] = -gradient[:, :, 1:].sum(axis=2)
-    return make_set(kind, triangles, gradient, np.asarray(weight_per_area) * area, inverse=inverse)
+    return make_set(kind, triangles, gradient, np.asarray(weight_per_area) * area, inverse=inverse, **data)
+
+
+def _turned(rest_positions: np.ndarray, triangles: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(m, 2, 2) from the axes (`axis` in the triangle's plane, and across it) to those of `rest_shape`."""
+    x = rest_positions[triangles]
+    first = x[:, 1] - x[:, 0]
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    normal = np.cross(first, x[:, 2] - x[:, 0])
+    second = np.cross(normal / np.linalg.norm(normal, axis=1)[:, None], first)
+    along = np.stack([first @ axis, second @ axis], axis=1)
+    length = np.linalg.norm(along, axis=1)
+    bad = np.flatnonzero(length < 1e-3 * np.linalg.norm(axis))
+    if len(bad):
+        raise ValueError(f"triangle {bad[0]} (vertices {triangles[bad[0]].tolist()}) lies across the axis {axis.tolist()}")
+    along /= length[:, None]
+    return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=2)
 
 
 def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
@@ -79,17 +100,109 @@ def functions(real: Real) -> SimpleNamespace:
     return SimpleNamespace(deformation=deformation, wide_deformation=wide_deformation)
 
 
+@functools.cache
+def hessians(real: Real) -> SimpleNamespace:
+    """axes(f1, f2): an angle, singular values and vectors of F, and the normal; write(...): the blocks of an isotropic energy of them."""
+    scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
+    normal = normal_function(real)
+    zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
+
+    @wp.func
+    def block(k: vec3, p: scalar, q: scalar, tilt: vec2, u1: vec3, u2: vec3, n: vec3, a: vec2, b: vec2) -> mat33:
+        """The Hessian between two corners of gradients a and b in the axes of the singular values."""
+        h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
+        h12 = k[1] * a[0] * b[1] + q * a[1] * b[0]
+        h21 = k[1] * a[1] * b[0] + q * a[0] * b[1]
+        h22 = k[2] * a[1] * b[1] + p * a[0] * b[0]
+        hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
+        return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
+
+    @wp.func
+    def axes(f1: vec3, f2: vec3):
+        """F^T F = V diag(s^2) V^T, V the rotation by `angle`; s1 and s2 follow from their sum and difference of squares without cancellation."""
+        n = normal(f1, f2)
+        c11 = wp.dot(f1, f1)
+        c12 = wp.dot(f1, f2)
+        c22 = wp.dot(f2, f2)
+        angle = half * wp.atan2(scalar(2.0) * c12, c11 - c22)
+        c = wp.cos(angle)
+        s = wp.sin(angle)
+        h1 = c * f1 + s * f2
+        h2 = c * f2 - s * f1
+        s1 = wp.length(h1)
+        s2 = wp.length(h2)
+        u1 = wp.normalize(h1)
+        u2 = wp.cross(n, u1)
+        if s1 < s2:
+            u2 = wp.normalize(h2)
+            u1 = wp.cross(u2, n)
+        return angle, s1, s2, u1, u2, n
+
+    @wp.func
+    def write(
+        stretch: vec3,
+        pair: vec2,
+        tilted: vec2,
+        w: scalar,
+        angle: scalar,
+        u1: vec3,
+        u2: vec3,
+        n: vec3,
+        b: mat22,
+        project: int,
+        at: int,
+        blocks_out: wp.array(dtype=mat33),
+    ):
+        """w times the Hessian of an energy of the singular values whose derivatives are stretch, pair and tilted; see `kernels`."""
+        k = stretch
+        tilt = tilted
+        c = wp.cos(angle)
+        s = wp.sin(angle)
+        # the positive part of the stretch, twist, flip and tilt
+        mean = half * (k[0] + k[2])
+        spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
+        low = mean - spread
+        if low < zero and project != 0:
+            high = wp.max(mean + spread, zero)
+            # high times the projector on its eigenvector
+            cosine = zero
+            sine = zero
+            if spread > zero:
+                cosine = half * (k[0] - k[2]) / spread
+                sine = k[1] / spread
+            k = half * high * vec3(one + cosine, sine, one - cosine)
+        k = w * k
+        t = pair[0]
+        flip = pair[1]
+        if project != 0:
+            t = wp.max(t, zero)
+            flip = wp.max(flip, zero)
+            tilt = vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
+        p = half * w * (flip + t)
+        q = half * w * (flip - t)
+        out = w * tilt
+        g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
+        g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])
+        g0 = -(g1 + g2)
+        blocks_out[at] = block(k, p, q, out, u1, u2, n, g0, g0)
+        blocks_out[at + 1] = block(k, p, q, out, u1, u2, n, g0, g1)
+        blocks_out[at + 2] = block(k, p, q, out, u1, u2, n, g0, g2)
+        blocks_out[at + 3] = block(k, p, q, out, u1, u2, n, g1, g1)
+        blocks_out[at + 4] = block(k, p, q, out, u1, u2, n, g1, g2)
+        blocks_out[at + 5] = block(k, p, q, out, u1, u2, n, g2, g2)
+
+    return SimpleNamespace(axes=axes, write=write)
+
+
 def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable], principal: Callable) -> SimpleNamespace:
     """Force, energy and Hessian of triangles of the energy |F - P|^2 / 2.
 
     project_of(real): makes project(f1, f2), the two columns of P as rows of a 2x3 matrix. principal(s1, s2): see `tets`; the stretch
     W_11, W_12, W_22, then what it costs to twist, to flip, and per axis to tilt out of the plane, W_i / s_i.
     """
-    scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
-    wp.types.matrix((2, 3), scalar)
+    scalar, vec3, mat22, mat33 = real.scalar, real.vec3, real.mat22, real.mat33
     project, wide_project = project_of(real), project_of(real_of("float64"))
-    f_of, normal = functions(real), normal_function(real)
-    zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
+    f_of, own = functions(real), hessians(real)
 
     @named(module, "force")
     def force(
@@ -132,16 +245,6 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         d = wide_project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.ddot(d, d)
 
-    @wp.func
-    def block(k: vec3, p: scalar, q: scalar, tilt: vec2, u1: vec3, u2: vec3, n: vec3, a: vec2, b: vec2) -> mat33:
-        """The Hessian between two corners of gradients a and b in the axes of the singular values."""
-        h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
-        h12 = k[1] * a[0] * b[1] + q * a[1] * b[0]
-        h21 = k[1] * a[1] * b[0] + q * a[0] * b[1]
-        h22 = k[2] * a[1] * b[1] + p * a[0] * b[0]
-        hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
-        return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
-
     @named(module, "hessian")
     def hessian(
         first: int,
@@ -156,62 +259,10 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     ):
         """The six blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
-        b = inverse[e]
-        f = f_of.deformation(base, u, vertices[e], b)
-        f1 = vec3(f[0, 0], f[0, 1], f[0, 2])
-        f2 = vec3(f[1, 0], f[1, 1], f[1, 2])
-        n = normal(f1, f2)
-        # F^T F = V diag(s^2) V^T; s1 and s2 follow from their sum and difference of squares without cancellation
-        c11 = wp.dot(f1, f1)
-        c12 = wp.dot(f1, f2)
-        c22 = wp.dot(f2, f2)
-        angle = half * wp.atan2(scalar(2.0) * c12, c11 - c22)
-        c = wp.cos(angle)
-        s = wp.sin(angle)
-        h1 = c * f1 + s * f2
-        h2 = c * f2 - s * f1
-        s1 = wp.length(h1)
-        s2 = wp.length(h2)
-        u1 = wp.normalize(h1)
-        u2 = wp.cross(n, u1)
-        if s1 < s2:
-            u2 = wp.normalize(h2)
-            u1 = wp.cross(u2, n)
+        f = f_of.deformation(base, u, vertices[e], inverse[e])
+        angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
         k, pair, tilt = principal(s1, s2)
-        # the positive part of the stretch, twist, flip and tilt
-        mean = half * (k[0] + k[2])
-        spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
-        low = mean - spread
-        if low < zero and project[0] != 0:
-            high = wp.max(mean + spread, zero)
-            # high times the projector on its eigenvector
-            cosine = zero
-            sine = zero
-            if spread > zero:
-                cosine = half * (k[0] - k[2]) / spread
-                sine = k[1] / spread
-            k = half * high * vec3(one + cosine, sine, one - cosine)
-        w = weight[e]
-        k = w * k
-        t = pair[0]
-        flip = pair[1]
-        if project[0] != 0:
-            t = wp.max(t, zero)
-            flip = wp.max(flip, zero)
-            tilt = vec2(wp.max(tilt[0], zero), wp.max(tilt[1], zero))
-        p = half * w * (flip + t)
-        q = half * w * (flip - t)
-        out = w * tilt
-        g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
-        g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])
-        g0 = -(g1 + g2)
-        at = offset + 6 * e
-        blocks_out[at] = block(k, p, q, out, u1, u2, n, g0, g0)
-        blocks_out[at + 1] = block(k, p, q, out, u1, u2, n, g0, g1)
-        blocks_out[at + 2] = block(k, p, q, out, u1, u2, n, g0, g2)
-        blocks_out[at + 3] = block(k, p, q, out, u1, u2, n, g1, g1)
-        blocks_out[at + 4] = block(k, p, q, out, u1, u2, n, g1, g2)
-        blocks_out[at + 5] = block(k, p, q, out, u1, u2, n, g2, g2)
+        own.write(k, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pdipc.scene import generators, meshes, rods, sewing
+from pdipc.scene import generators, meshes, pattern, rods, sewing
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
@@ -52,7 +52,9 @@ class AssembledBody:
     are its segments (a, b, b). joints: (j, 2) int32, segments of a rod that follow each other. ghosts: (s,) int32, the points that mark
     how its segments are twisted, the last of its vertices; none where it twists freely.
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
-    trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. origin (3,) m and orientation (3, 3): where its
+    trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. pattern: (m, 3, 3) m, the corners of each
+    triangle of a cloth that is cut from flat panels, as they are there.
+    origin (3,) m and orientation (3, 3): where its
     mesh's origin and axes are at the start.
     """
 
@@ -71,6 +73,14 @@ class AssembledBody:
     orientation: np.ndarray = field(default_factory=lambda: np.eye(3))
     joints: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int32))
     ghosts: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    pattern: np.ndarray | None = None
+
+    @property
+    def elastic_shape(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Points (3 m, 3) m and triangles (m, 3) of a cloth's own rest shape; None where that is its mesh's."""
+        if self.pattern is None:
+            return None
+        return self.pattern.reshape(-1, 3), np.arange(3 * len(self.pattern), dtype=np.int32).reshape(-1, 3)
 
     @property
     def kinematic(self) -> bool:
@@ -414,6 +424,10 @@ def gather(
             marks = rods.ghost_points(rest, start, mesh.lines, mesh.joints, placed.material.radius)
             ghosts = np.arange(len(rest), len(rest) + len(marks[0]), dtype=np.int32)
             rest, start = np.concatenate([rest, marks[0]]), np.concatenate([start, marks[1]])
+        cut = None
+        if isinstance(placed, Cloth) and placed.rest is not None:
+            with _noting(problems):
+                cut = pattern.corners_at_rest(placed, len(mesh.triangles))
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
@@ -431,6 +445,7 @@ def gather(
                 orientation=rotation_matrix(placed.rotation),
                 joints=mesh.joints,
                 ghosts=ghosts + first,
+                pattern=cut,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):

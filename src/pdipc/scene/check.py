@@ -12,7 +12,7 @@ from pdipc.judge import boxes
 from pdipc.judge.witness import find_intersections
 from pdipc.scene import meshes, rods
 from pdipc.scene.assembly import AssembledBody, Assembly, gather
-from pdipc.scene.check_garments import check_garments
+from pdipc.scene.check_garments import check_garments, cloth_settings
 from pdipc.scene.errors import SceneError
 from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
@@ -136,12 +136,8 @@ def _settings(scene: Scene) -> Iterator[Finding]:
         if model in ("corotated", "neo_hookean") and not newton:
             found = f'is "{model}", which no local projection belongs to'
             yield Finding(f'body "{body.name}": material.model', found, 'take "arap", or the Newton solver')
-        if isinstance(body, Cloth) and body.inside is not None and not newton:
-            yield Finding(
-                f'body "{body.name}": inside',
-                "needs the Newton solver",
-                "leave it out, or take the barrier's contact and newton",
-            )
+        if isinstance(body, Cloth):
+            yield from cloth_settings(body, newton)
     aggregates = solver == "a-jacobi" or (solver == "auto" and method == "paper")
     if aggregates and method == "barrier":
         found = f'"{solver}" cannot take the contacts of contact.method = "{method}"'

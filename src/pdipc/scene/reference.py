@@ -21,6 +21,7 @@ SECTIONS = {
         schema.SolidMaterial,
         schema.Cloth,
         schema.ClothMaterial,
+        schema.Pattern,
         garments.Inside,
         schema.Rod,
         schema.RodMaterial,

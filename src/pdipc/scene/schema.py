@@ -381,6 +381,27 @@ class ClothMaterial(Table):
         default=None, le=1e9, description="Young's modulus times thickness, N/m; in place of young_modulus."
     )
     poisson_ratio: Real = Field(default=0.3, ge=0, le=0.499, description="Poisson's ratio in the plane.")
+    weft_stiffness: Positive | None = Field(
+        default=None,
+        le=1e9,
+        description="Of woven cloth along its weft, N/m; membrane_stiffness is then that along its warp. Absent: alike in all directions. "
+        "Needs the Newton solver, as all of woven cloth does.",
+    )
+    shear_stiffness: Positive | None = Field(
+        default=None,
+        le=1e9,
+        description="Of woven cloth, N/m: force per length over angle. Absent: sqrt(warp weft) / (2 (1 + poisson_ratio)), as without a weave.",
+    )
+    warp: Vector | None = Field(
+        default=None,
+        description="Direction of the warp of woven cloth in the coordinates of the flat rest shape, else of the mesh; absent: (1, 0, 0).",
+    )
+    strain_limit: Positive | None = Field(
+        default=None,
+        le=10.0,
+        description="By what part of its rest length cloth stretches at most, in any direction; holds within 1 % of itself. Needs the Newton "
+        "solver.",
+    )
     area_stiffness: NotNegative = Field(
         default=0.0,
         le=1e9,
@@ -399,12 +420,21 @@ class ClothMaterial(Table):
         default="strain", description='"springs" replaces the triangles\' elasticity by one spring an edge.'
     )
 
+    @property
+    def is_woven(self) -> bool:
+        """Whether it is stiffer one way than another."""
+        return self.weft_stiffness is not None or self.shear_stiffness is not None
+
     @model_validator(mode="after")
     def _fill(self) -> "ClothMaterial":
         """Completes the stiffnesses, so that readers find numbers; what was given stays known in `model_fields_set`."""
         stretch, bend = self.membrane_stiffness, self.bending_stiffness
-        if self.membrane == "springs" and self.area_stiffness:
-            raise ValueError('area_stiffness has no effect on springs; take membrane = "strain"')
+        if self.membrane == "springs":
+            for name in ("area_stiffness", "weft_stiffness", "shear_stiffness", "warp"):
+                if getattr(self, name):
+                    raise ValueError(f'{name} has no effect on springs; take membrane = "strain"')
+        if self.warp is not None and not (self.is_woven and any(self.warp)):
+            raise ValueError("warp must be a direction, and needs weft_stiffness or shear_stiffness beside it")
         if stretch is None or "membrane_stiffness" not in self.model_fields_set:
             stretch = (self.young_modulus or 1e5) * self.thickness
         elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, stretch, rtol=1e-6):
@@ -633,11 +663,36 @@ class Solid(Body):
     )
 
 
+class Pattern(Table):
+    """The flat panels that a cloth is cut from: each triangle of the cloth's mesh is at rest in the shape of its triangle here.
+
+    Panels may lie anywhere in the pattern, and may overlap: only the shapes of triangles count. Masses are those of the pattern.
+    """
+
+    mesh: MeshSource | None = Field(
+        default=None,
+        description="A mesh of as many triangles as the cloth's, in the same order and each with its corners in the same order.",
+    )
+    uv: StrictBool = Field(
+        default=False, description="In place of a mesh: the texture coordinates of the cloth's own .obj file."
+    )
+    scale: Positive = Field(default=1.0, description="Metres in a unit of the pattern.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Pattern":
+        _exactly_one(self, "mesh", "uv")
+        return self
+
+
 class Cloth(Body):
     """A thin sheet of triangles."""
 
     kind: Literal["cloth"] = "cloth"
     material: ClothMaterial = Field(default_factory=ClothMaterial, description="What it is made of.")
+    rest: Pattern | None = Field(
+        default=None,
+        description="Flat panels that it is cut from; absent: its mesh is its rest shape. The mesh is then where it starts.",
+    )
     inside: Inside | None = Field(
         default=None, description="What each closed part of it holds: a pressure, a gas or a liquid; needs the Newton solver."
     )

@@ -1,0 +1,154 @@
+"""A limit of the stretch of cloth: a barrier on each singular value s of F, which no load of a sensible size passes by more than 1 % of it.
+
+With y = (s - 1) / limit, the part of the limit that is used,
+
+    phi(y) = -(y - 0.9)^2 ln((1.01 - y) / 0.11)  for y > 0.9,   W = w limit^2 (phi(y1) + phi(y2)),
+
+which begins smoothly at 0.9, pulls as the membrane itself does near 1, and without bound towards 1.01 (as the strain limit of Codim-IPC,
+Li et al. 2021, does). From FIRM short of 1.01 on it goes on as a parabola, with a tension of a thousand w limit already: a script that pulls
+cloth farther than its limit must find a finite energy.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from pdipc.constraints import triangles
+from pdipc.constraints.base import ConstraintSet
+from pdipc.device.launch import Device
+from pdipc.device.precision import Real
+from pdipc.device.precision import kernel as named
+from pdipc.device.precision import real as real_of
+
+NAME = "strain_limit"
+CORNERS = triangles.CORNERS
+PROJECTIVE = False
+BEGIN, END = 0.9, 1.01  # of the limit: where the barrier begins, and what it never lets pass
+CLOSE = {"float32": 1e-3, "float64": 1e-6}  # of the limit: stretches that differ by less are taken for one
+FIRM = 1e-4  # of what lies between them: how close to END the parabola takes over
+
+
+def rest(rest_positions: np.ndarray, vertices: np.ndarray, weight_per_area, limit) -> ConstraintSet:
+    """Triangles `vertices` (m, 3) that stretch by no more than `limit`, a part of the rest length. weight_per_area: N/m."""
+    return triangles.make(NAME, rest_positions, vertices, weight_per_area, limit=np.full(len(vertices), float(limit)))
+
+
+def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
+    """What the kernels take between the vertices and the weights."""
+    limit = wp.array(s.data["limit"], dtype=real.scalar, device=device.warp)
+    return [*triangles.arguments(device, real, s), limit]
+
+
+@functools.cache
+def functions(real: Real) -> SimpleNamespace:
+    """barrier(s, limit): W, W' and W'' of one singular value, over w."""
+    scalar, vec3 = real.scalar, real.vec3
+    begin, width = wp.constant(scalar(BEGIN)), wp.constant(scalar(END - BEGIN))
+    firm, zero, one, two = (wp.constant(scalar(value)) for value in (FIRM, 0.0, 1.0, 2.0))
+
+    @wp.func
+    def barrier(s: scalar, limit: scalar) -> vec3:
+        t = ((s - one) / limit - begin) / width  # from 0 to 1
+        if t <= zero:
+            return vec3()
+        a = wp.min(t, one - firm)
+        log = wp.log(one - a)
+        rest = one - a
+        value = -a * a * log
+        slope = a * (a / rest - two * log)
+        bend = -two * log + two * two * a / rest + a * a / (rest * rest)
+        more = t - a
+        value += more * (slope + more * bend / two)
+        slope += more * bend
+        return vec3(width * width * limit * limit * value, width * limit * slope, bend)
+
+    return SimpleNamespace(barrier=barrier)
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
+    module = real.module(__name__)
+    f_of, own, wide_own = triangles.functions(real), triangles.hessians(real), triangles.hessians(real_of("float64"))
+    barrier, wide_barrier = functions(real).barrier, functions(real_of("float64")).barrier
+    wide, tiny, close = wp.float64, wp.constant(scalar(1.0e-3)), wp.constant(scalar(CLOSE[real.name]))
+
+    @named(module, "force")
+    def force(
+        first: int,
+        vertices: wp.array(dtype=wp.vec3i),
+        inverse: wp.array(dtype=mat22),
+        limit: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        offset: int,
+        corners_out: wp.array(dtype=vec3),
+    ):
+        """-w dW/dF G at the three corners, dW/dF = sum W_i u_i v_i^T."""
+        e = first + wp.tid()
+        b = inverse[e]
+        f = f_of.deformation(base, u, vertices[e], b)
+        angle, s1, s2, u1, u2, _n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
+        t1 = weight[e] * barrier(s1, limit[e])[1] * u1
+        t2 = weight[e] * barrier(s2, limit[e])[1] * u2
+        c = wp.cos(angle)
+        s = wp.sin(angle)
+        d1 = -(c * t1 - s * t2)
+        d2 = -(s * t1 + c * t2)
+        g1 = b[0, 0] * d1 + b[0, 1] * d2
+        g2 = b[1, 0] * d1 + b[1, 1] * d2
+        corner = offset + 3 * e
+        corners_out[corner] = -(g1 + g2)
+        corners_out[corner + 1] = g1
+        corners_out[corner + 2] = g2
+
+    @named(module, "energy")
+    def energy(
+        first: int,
+        vertices: wp.array(dtype=wp.vec3i),
+        inverse: wp.array(dtype=mat22),
+        limit: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        offset: int,
+        energy_out: wp.array(dtype=wide),
+    ):
+        e = first + wp.tid()
+        f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
+        _angle, s1, s2, _u1, _u2, _n = wide_own.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
+        total = wide_barrier(s1, wide(limit[e]))[0] + wide_barrier(s2, wide(limit[e]))[0]
+        energy_out[offset + e] = wide(weight[e]) * total
+
+    @named(module, "hessian")
+    def hessian(
+        first: int,
+        vertices: wp.array(dtype=wp.vec3i),
+        inverse: wp.array(dtype=mat22),
+        limit: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        offset: int,
+        project: wp.array(dtype=wp.int32),
+        blocks_out: wp.array(dtype=mat33),
+    ):
+        """The six blocks of corners a <= b. W is convex: there is nothing to project."""
+        e = first + wp.tid()
+        f = f_of.deformation(base, u, vertices[e], inverse[e])
+        angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
+        w1 = barrier(s1, limit[e])
+        w2 = barrier(s2, limit[e])
+        # (W1 - W2) / (s1 - s2), from the middle where they are close
+        flip = barrier(scalar(0.5) * (s1 + s2), limit[e])[2]
+        if wp.abs(s1 - s2) > close * limit[e]:
+            flip = (w1[1] - w2[1]) / (s1 - s2)
+        pair = vec2((w1[1] + w2[1]) / wp.max(s1 + s2, tiny), flip)
+        tilt = vec2(w1[1] / wp.max(s1, tiny), w2[1] / wp.max(s2, tiny))
+        stretch = vec3(w1[2], scalar(0.0), w2[2])
+        own.write(stretch, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
+
+    return SimpleNamespace(force=force, energy=energy, hessian=hessian)
