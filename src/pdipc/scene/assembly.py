@@ -54,8 +54,7 @@ class AssembledBody:
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
     trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. pattern: (m, 3, 3) m, the corners of each
     triangle of a cloth that is cut from flat panels, as they are there.
-    origin (3,) m and orientation (3, 3): where its
-    mesh's origin and axes are at the start.
+    origin (3,) m and orientation (3, 3): where its mesh's origin and axes are at the start.
     """
 
     name: str
