@@ -216,7 +216,19 @@ def test_info_describes_runs_and_scenes(folder, scene):
     assert told.exit_code == 0, told.stderr
     assert "4 frames, 0.03 s; 3 of 8 steps done" in told.stdout
     assert "cloth" in runner.invoke(app, ["info", str(scene)]).stdout
-    assert runner.invoke(app, ["info", "twisted_cloth"]).exit_code == 0
+    assert "pin of cloth: 25 vertices, held exactly\n" in runner.invoke(app, ["info", "twisted_cloth"]).stdout
+
+
+def test_info_tells_how_pins_hold(tmp_path):
+    rail = 'bodies = [{ name = "c", kind = "cloth", mesh = { shape = "grid" }, pins = [\n'
+    rail += '{ select = { all = true }, axes = "zy", stiffness = 5.0, start = 1.5 },\n'
+    rail += '{ select = { vertices = [1] }, follow = "o", end = 2 } ] }]\n'
+    rail += 'obstacles = [{ name = "o", mesh = { shape = "plane" }, translation = [0, -1, 0] }]\n'
+    (tmp_path / "s.toml").write_text(rail)
+    told = runner.invoke(app, ["info", str(tmp_path / "s.toml")])
+    assert told.exit_code == 0, told.stderr
+    assert "vertices, held by 5 N/m along yz, from 1.5 s on\n" in told.stdout
+    assert "pin of c: 1 vertices, held exactly, moving with o, until 2 s\n" in told.stdout
 
 
 def test_info_tells_convergence_time_and_machine(folder):

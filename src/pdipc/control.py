@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from pdipc.device.launch import one_at_a_time
 from pdipc.integration.script import Lead
 from pdipc.model import Model, State
-from pdipc.scene.assembly import AssembledBody
+from pdipc.scene.assembly import AssembledBody, AssembledPin
 from pdipc.scene.check import LARGEST, check_placed
 from pdipc.scene.motion import rotation_matrix
+from pdipc.scene.movers import Mover
 from pdipc.work import Work
 
 SPEED = 1.0  # m/s
@@ -66,8 +67,8 @@ class Controls:
     @one_at_a_time
     def pose(self, obstacle: str) -> tuple[np.ndarray, np.ndarray]:
         """Where a rigid obstacle is: position (3,) m of its mesh's origin, and rotation (3, 3) of its mesh."""
-        number, body = self._rigid(obstacle)
-        turn, place = self.state.reached.pose(self.work.script.movers[number])
+        mover, body = self._rigid(obstacle)
+        turn, place = self.state.reached.pose(mover)
         return place, turn.as_matrix() @ body.orientation
 
     @one_at_a_time
@@ -79,15 +80,14 @@ class Controls:
 
         Raises ValueError where there is no such obstacle, it deforms, or values are none.
         """
-        number, body = self._rigid(obstacle)
-        mover = self.work.script.movers[number]
-        lead = self.work.script.leads.get(number)
+        mover, body = self._rigid(obstacle)
+        lead = self.work.script.leads.get(mover.key)
         turn, place = self.state.reached.pose(mover) if lead is None or lead.pose is None else lead.pose
         if position is not None:
             place = _numbers(position, (3,), "position")
         if rotation is not None:
             turn = _turn(rotation) * Rotation.from_matrix(body.orientation).inv()
-        self.work.lead(number, Lead(_speed(speed), pose=(turn, place)))
+        self.work.lead(mover.key, Lead(_speed(speed), pose=(turn, place)))
 
     @one_at_a_time
     def set_vertices(self, obstacle: str, vertices: Any, speed: float = SPEED) -> None:
@@ -95,22 +95,23 @@ class Controls:
 
         Raises ValueError where there is no such obstacle, or vertices are of another number or no finite numbers.
         """
-        number, body = self._obstacle(obstacle)
+        mover, body = self._obstacle(obstacle)
         points = _numbers(vertices, (body.last - body.first, 3), f'vertices of obstacle "{obstacle}"')
-        self.work.lead(number, Lead(_speed(speed), points=points))
+        self.work.lead(mover.key, Lead(_speed(speed), points=points))
 
     @one_at_a_time
     def set_pin(self, body: str, points: Any, pin: int = 0, speed: float = SPEED) -> None:
-        """Leads what a pin of a body holds to points (k, 3) m, or one (3,) for all, each straight: vertices in ascending order; where the
-        pin has a stiffness, the points that its springs end at. pin: its place among the body's pins. speed: m/s, of the fastest.
+        """Leads what a pin of a body holds to points (k, 3) m, or (3,) where it holds one vertex, each straight; in the order of
+        `model.assembly.pins`, which is ascending. Where the pin has a stiffness, these are the points that its springs end at.
+        pin: its place among the body's pins. speed: m/s, of the fastest.
 
         Raises ValueError where there is no such pin, or points are of another number or no finite numbers.
         """
         place, held = self._pin(body, pin)
-        if np.shape(points) == (3,):
-            points = np.tile(points, (len(held.vertices), 1))
+        if np.shape(points) == (3,) and len(held.vertices) == 1:
+            points = [points]
         points = _numbers(points, (len(held.vertices), 3), f"points of {held.where}")
-        self.work.lead_pin(place, Lead(_speed(speed), points=points))
+        self.work.lead(-1 - place, Lead(_speed(speed), points=points))
 
     # Bodies.
 
@@ -237,21 +238,24 @@ class Controls:
     def _body(self, name: str) -> AssembledBody:
         return self._named(name, False)
 
-    def _obstacle(self, name: str) -> tuple[int, AssembledBody]:
+    def _obstacle(self, name: str) -> tuple[Mover, AssembledBody]:
         body = self._named(name, True)
         place = self.model.assembly.bodies.index(body)
-        return next(n for n, mover in enumerate(self.work.script.movers) if mover.body == place), body
+        return next(mover for mover in self.work.script.movers if mover.body == place), body
 
-    def _rigid(self, name: str) -> tuple[int, AssembledBody]:
-        number, body = self._obstacle(name)
-        lead = self.work.script.leads.get(number)
-        if not self.work.script.movers[number].rigid or (lead is not None and lead.points is not None):
+    def _rigid(self, name: str) -> tuple[Mover, AssembledBody]:
+        mover, body = self._obstacle(name)
+        lead = self.work.script.leads.get(mover.key)
+        if not mover.rigid or (lead is not None and lead.points is not None):
             raise ValueError(f'obstacle "{name}" deforms and has no pose; lead it with set_vertices')
-        return number, body
+        return mover, body
 
-    def _pin(self, name: str, pin: int) -> tuple[int, Any]:
+    def _pin(self, name: str, pin: int) -> tuple[int, AssembledPin]:
         self._body(name)
         own = [(place, each) for place, each in enumerate(self.model.assembly.pins) if each.body == name]
         if not 0 <= pin < len(own):
             raise ValueError(f'body "{name}" has no pin {pin}; it has {len(own)}')
-        return own[pin]
+        place, held = own[pin]
+        if held.follow >= 0:
+            raise ValueError(f'{held.where} moves with "{self.model.assembly.bodies[held.follow].name}"; lead that')
+        return place, held

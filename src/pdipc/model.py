@@ -13,11 +13,13 @@ from pdipc import cloth, constraints, rods
 from pdipc.collision import surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.constraints import (
+    axis_attachment,
     corotated,
     edge_length,
     material,
     neo_hookean,
     point_attachment,
+    surface_attachment,
     tet_strain,
     tet_volume,
     tets,
@@ -84,9 +86,7 @@ class State:
             "velocities": self.velocities.numpy().copy(),
             "accelerations": self.accelerations.numpy().copy(),
             "remainders": self.remainders.numpy().copy(),
-            "reached_times": self.reached.times.copy(),
-            "reached_poses": self.reached.poses.copy(),
-            "reached_anchors": self.reached.anchors.copy(),
+            **self.reached.arrays(),
             "time": np.float64(self.time),
             "step": np.int64(self.step),
         }
@@ -181,9 +181,7 @@ class Model:
         arrays = {"remainders": np.zeros_like(arrays["positions"]), **arrays}  # files of earlier versions have none
         vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
         time = float(arrays["time"])
-        reached = Reached.at(time, self.assembly)
-        if "reached_times" in arrays:
-            reached = Reached(*(np.array(arrays[f"reached_{name}"]) for name in ("times", "poses", "anchors")))
+        reached = Reached.from_arrays(arrays) if "reached_times" in arrays else Reached.at(time, self.assembly)
         return State(*vectors, reached, time=time, step=int(arrays.get("step", 0)))
 
     def set_time(self, time: float) -> None:
@@ -217,6 +215,16 @@ def build(scene: Scene, device: str | Device | None = None) -> Model:
     refuse(scene, assembly, number.name)
     for name, far in (assembly.separated or {}).items():
         warnings.warn(moved_note(name, far), SceneWarning, stacklevel=2)
+    return _made(scene, assembly, place, number)
+
+
+def reassembled(model: Model, assembly: Assembly) -> Model:
+    """The model of another assembly of the same scene, such as one whose pins hold other vertices."""
+    return _made(model.scene, assembly, model.device, model.real)
+
+
+def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Model:
+    sim = scene.simulation
     h = sim.time_step / sim.substeps
     n = len(assembly.positions)
     free = np.ones(n, dtype=bool)
@@ -365,8 +373,13 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
             sets += own
             mass += its_mass
     for pin in assembly.pins:
-        if pin.stiffness is not None:
-            sets.append(point_attachment.rest(assembly.pin_targets(pin, 0.0), pin.vertices, pin.stiffness))
+        if pin.anchored and pin.axes.all():
+            sets.append(point_attachment.rest(pin.points, pin.vertices, pin.stiffness))
+        elif pin.anchored:
+            axes = np.tile(pin.axes, (len(pin.vertices), 1))
+            sets.append(axis_attachment.rest(pin.points, pin.vertices, axes, pin.stiffness))
+        elif pin.active and pin.follow >= 0 and len(pin.elements):
+            sets.append(surface_attachment.rest(assembly.positions, pin.elements, pin.weights, pin.stiffness))
     for a in assembly.attachments:
         pairs = np.stack([a.vertices_a, a.vertices_b], axis=1)
         sets.append(edge_length.rest(x, pairs, a.stiffness, a.rest_lengths))

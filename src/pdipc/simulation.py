@@ -16,6 +16,7 @@ from pdipc.device.launch import one_at_a_time
 from pdipc.drive import StepResult, Work, step
 from pdipc.forces import collect, mean
 from pdipc.model import Model, State, build
+from pdipc.phases import model_at
 from pdipc.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ class Simulation(Controls):
         self.model.device.refuse_forked()
         results, contact = [], []
         for _ in range(self.model.substeps):
+            self._hold()
             results.append(step(self.model, self.state, self.work, self.observe, into=self.state))
             if forces:
                 contact.append(collect(self.model, self.positions, self.work.method.exerted()))
@@ -88,12 +90,23 @@ class Simulation(Controls):
         result.forces = mean(contact) if forces else None
         return result
 
+    def _hold(self) -> None:
+        """Changes the model where pins begin or end; commands go on."""
+        model = model_at(self.model, self.state)
+        if model is not self.model:
+            before, self.model = self.work, model
+            self.work = Work(model)
+            self.work.loads.take_over(before.loads)
+            self.work.follow(before.script.leads)
+            wp.copy(self.work.x, self.state.positions)  # what was proven
+
     @one_at_a_time
     def reset(self) -> None:
         """Back to the start, with no command."""
         self.work.follow({})
         self.work.loads.reset()
         self.state = self.model.initial_state()
+        self._hold()
         wp.copy(self.work.x, self.state.positions)  # the start was judged when the model was built
         self.work.candidates.invalidate()
 

@@ -86,18 +86,17 @@ class Work:
     def set_scripted(self, state: State) -> None:
         """Where kinematic vertices go in a step from `state`, only uploaded where they move, and the external accelerations."""
         self.script.plan(state.time, state.reached, state.positions)
-        if self.script.anchors is not None and self.model.projector.anchors is not None:
-            self.model.projector.anchors.assign(self.script.anchors)
+        projector, anchors, rails = self.model.projector, self.script.anchors, self.script.on_rails
+        if anchors is not None:
+            for points, own in ((projector.anchors, anchors[~rails]), (projector.rails, anchors[rails])):
+                if points is not None:
+                    points.assign(own)
         self.model.set_time(state.time + self.model.settings.time_step)
         self.loads.update(state.time, state.positions, state.velocities)
 
-    def lead(self, number: int, lead: Lead) -> None:
-        """A mover of the script follows a command from the next step on."""
-        self.follow({**self.script.leads, number: lead})
-
-    def lead_pin(self, pin: int, lead: Lead) -> None:
-        """As `lead`, for a pin of the assembly."""
-        self.lead(self.script.number_of_pin(pin), lead)
+    def lead(self, key: int, lead: Lead) -> None:
+        """What has this key in `Script.leads` follows a command from the next step on."""
+        self.follow({**self.script.leads, key: lead})
 
     def follow(self, leads: dict[int, Lead]) -> None:
         """These commands, and no others, from the next step on."""

@@ -18,6 +18,7 @@ from pdipc.constraints import (
     rod_ghost,
     stitch,
     strain_limit,
+    surface_attachment,
     tet_strain,
     tet_volume,
     triangle_area,
@@ -71,6 +72,11 @@ def elements(kind, rng):
         rest = rng.standard_normal((12, 3))
         weights = np.array([[0.2, 0.3, 0.5], [0.6, 0.4, 0.0], [1.0, 0.0, 0.0]])
         return rest, rest, stitch.rest(np.arange(12).reshape(3, 4), weights, 2.0, [9.0, 0.3, 0.0])
+    if kind is surface_attachment:
+        rest = rng.standard_normal((12, 3))
+        weights = np.array([[0.2, 0.3, 0.5], [0.6, 0.4, 0.0], [1.0, 0.0, 0.0]])
+        now = rest + 0.3 * rng.standard_normal(rest.shape)
+        return rest, now, kind.rest(rest, np.arange(12).reshape(3, 4), weights, 2.0)
     if kind is edge_length:
         rest = rng.standard_normal((8, 3))
         vertices = np.arange(8, dtype=np.int32).reshape(4, 2)
@@ -137,7 +143,7 @@ def prepared(kind, seed=0):
     return projector, rest, now - rest, s.vertices
 
 
-ROWS = [*SOLIDS, *SHEETS, edge_length, curved_bending, stitch, rod_bending]
+ROWS = [*SOLIDS, *SHEETS, edge_length, curved_bending, stitch, surface_attachment, rod_bending]
 BENDING = [*ROWS, rod_frames, rod_ghost]
 
 

@@ -6,6 +6,7 @@ import warp as wp
 
 from pdipc import constraints
 from pdipc.constraints import (
+    axis_attachment,
     corotated,
     curved_bending,
     edge_length,
@@ -19,6 +20,7 @@ from pdipc.constraints import (
     rod_ghost,
     stitch,
     strain_limit,
+    surface_attachment,
     tet_strain,
     tet_volume,
     triangle_area,
@@ -70,9 +72,15 @@ def make(kind, rng):
         weights = np.array([[0.2, 0.3, 0.5], [1.0, 0.0, 0.0]])
         distance = np.linalg.norm(np.einsum("ek,ekd->ed", weights, x.reshape(2, 4, 3)[:, 1:]) - x[::4], axis=1)
         return x, kind.rest(np.arange(8).reshape(2, 4), weights, 2.0, distance)
+    if kind is surface_attachment:
+        x = rng.standard_normal((8, 3))
+        return x, kind.rest(x, np.arange(8).reshape(2, 4), np.array([[0.2, 0.3, 0.5], [1.0, 0.0, 0.0]]), 2.0)
     if kind is point_attachment:
         x = rng.standard_normal((4, 3))
         return x, kind.rest(x[:3], np.arange(3), 2.0)
+    if kind is axis_attachment:
+        x = rng.standard_normal((4, 3))
+        return x, kind.rest(x[:3], np.arange(3), [[1, 0, 0], [0, 1, 1], [1, 1, 1]], 2.0)
     if kind in (rod_bending, rod_frames, rod_ghost):
         # a bent chain of three segments with their ghost points
         x = np.array([[0, 0, 0], [1, 0, 0], [2, 0.3, 0], [2.7, 1, 0.2], [0.5, 0.5, 0], [1.5, 0.15, 0.6], [2.85, 0.15, 0.1]])
@@ -116,7 +124,7 @@ def test_energy_is_zero_at_rest_and_under_rigid_motion(kind):
     rng = np.random.default_rng(1)
     x, s = make(kind, rng)
     assert abs(energy(x, s)) < (REST_ENERGY if kind.PROJECTIVE else REST_ENERGY * 1e3)
-    if kind is not point_attachment:
+    if kind not in (point_attachment, axis_attachment):
         assert abs(energy(x @ rotation(rng).T + rng.standard_normal(3), s)) < REST_ENERGY * 1e6
 
 
@@ -145,6 +153,13 @@ def test_matrix_minus_targets_is_the_force(kind):
     if kind is quadratic_bending:
         x = x + rng.standard_normal(x.shape)
         np.testing.assert_allclose(forces(x, [s]), -dense @ x, atol=1e-9)
+
+
+def test_along_free_axes_nothing_is_held():
+    rng = np.random.default_rng(5)
+    x, s = make(axis_attachment, rng)
+    away = rng.standard_normal(x.shape)
+    np.testing.assert_allclose(forces(x + away, [s])[:3], -2.0 * away[:3] * s.data["axes"], atol=1e-12)
 
 
 def test_strain_projects_to_the_nearest_rotation():

@@ -14,6 +14,7 @@ from pdipc.cli.app import SceneArgument, command, load, metres
 
 if TYPE_CHECKING:
     from pdipc.output.results import Run
+    from pdipc.scene.assembly import Assembly
     from pdipc.scene.schema import Scene
     from pdipc.simulation import StepInfo
 
@@ -247,6 +248,8 @@ def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run fo
     for body in assembly.bodies:
         table.add_row(body.name, body.kind, str(body.last - body.first), str(len(body.triangles)), str(len(body.tets)))
     console.print(table)
+    for line in _pins(assembly):
+        console.print(line, markup=False)
     sim = scene.simulation
     console.print(f"{sim.steps} steps of {sim.time_step:g} s, linear solver {sim.linear_solver}, precision {sim.precision}")
     console.print(
@@ -256,6 +259,17 @@ def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run fo
     if opened is not None:
         for line in _told_of(opened, sim.steps):
             console.print(line, markup=False)
+
+
+def _pins(assembly: "Assembly") -> Iterator[str]:
+    """A line for each pin: what it holds, how, and when."""
+    for pin in assembly.pins:
+        axes = "".join(axis for axis, held in zip("xyz", pin.axes, strict=True) if held)
+        how = "exactly" if pin.stiffness is None else f"by {pin.stiffness:g} N/m" + (f" along {axes}" if axes != "xyz" else "")
+        with_what = f", moving with {assembly.bodies[pin.follow].name}" if pin.follow >= 0 else ""
+        since = f", from {pin.start:g} s on" if pin.start > 0.0 else ""
+        until = f", until {pin.end:g} s" if pin.end < float("inf") else ""
+        yield f"pin of {pin.body}: {len(pin.vertices)} vertices, held {how}{with_what}{since}{until}"
 
 
 def _told_of(opened: "Run", steps: int) -> Iterator[str]:

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.constraints import (
+    axis_attachment,
     corotated,
     curved_bending,
     edge_length,
@@ -19,6 +20,7 @@ from pdipc.constraints import (
     rod_ghost,
     stitch,
     strain_limit,
+    surface_attachment,
     tet_strain,
     tet_volume,
     triangle_area,
@@ -31,6 +33,8 @@ from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
 
 KINDS = (
+    axis_attachment,
+    surface_attachment,
     tet_strain,
     tet_volume,
     corotated,
@@ -83,7 +87,7 @@ class Projector:
     sets: one a kind, elements in the order of the bodies. bending: those of them whose Hessian depends on the state, in the order in
     which their blocks are stored.
     anchors: the points of attachments, (k,) vec3, or None; assign to it to move the points.
-    threads: the lengths of stitches, (k,), or None; assign to it to sew.
+    rails: likewise of attachments along some axes, and rail_hessian, what they add to Newton's matrix. threads: the lengths of stitches, (k,), or None; assign to it to sew.
     cavities: what closed sheets hold, or None; a part of the Newton matrix as well.
     energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
     blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row.
@@ -101,6 +105,8 @@ class Projector:
         self._batches = []
         self.bending: list[ConstraintSet] = []
         self.anchors: wp.array | None = None
+        self.rails: wp.array | None = None
+        self.rail_hessian: axis_attachment.Rails | None = None
         self.threads: wp.array | None = None
         self.cavities: enclosed_volume.Cavities | None = None
         slot = element = block = 0
@@ -110,6 +116,8 @@ class Projector:
             rest = kind.arguments(device, real, s)
             if kind is point_attachment:
                 self.anchors = rest[0]
+            if kind is axis_attachment:
+                self.rails, self.rail_hessian = rest[0], axis_attachment.Rails(device, real, n_vertices, s)
             if kind is stitch:
                 self.threads = rest[1]
             if kind is enclosed_volume:

@@ -194,6 +194,11 @@ class Loads:
         self._incident = [upload(starts.astype(np.int32), wp.int32), upload((order // 3).astype(np.int32), wp.int32)]
         self._inertia = upload(external.inertia.astype(real.numpy), real.scalar)
 
+    def take_over(self, other: "Loads") -> None:
+        """What a user changed there holds here, too."""
+        for name in ("gravity", "winds", "pulled"):
+            setattr(self.external, name, getattr(other.external, name))
+
     def reset(self) -> None:
         """Back to what the scene says."""
         self.external = copy.copy(self._scene)

@@ -20,7 +20,7 @@ stopped, by no other way, at CATCH_UP times the script's pace, so that nothing i
 
 import functools
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -185,23 +185,37 @@ class Reached:
 
     times: (bodies,) s, in its script; of bodies, and of what follows none, the time of the state. poses: (bodies, 7), the turn from the start as a
     quaternion x, y, z, w and the place of the origin, m, of what is led by a command; else 0. anchors: (k, 3) m, the points that the springs of
-    pins end at, pin by pin.
+    pins end at, pin by pin. caught: by which points pins that began later hold, arrays by name (`phases`).
     """
 
     times: np.ndarray
     poses: np.ndarray
     anchors: np.ndarray
+    caught: dict[str, np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def at(cls, time: float, assembly: Assembly) -> "Reached":
         """Everybody in time."""
         bodies = len(assembly.bodies)
-        anchors = [assembly.pin_targets(assembly.pins[pin], time) for pin in soft_pins(assembly)]
+        anchors = [assembly.pin_targets(assembly.pins[pin], time) for pin in anchored_pins(assembly)]
         return cls(np.full(bodies, time), np.zeros((bodies, 7)), np.concatenate([np.zeros((0, 3)), *anchors]))
 
     def copy(self) -> "Reached":
         """An independent copy."""
-        return Reached(self.times.copy(), self.poses.copy(), self.anchors.copy())
+        return Reached(self.times.copy(), self.poses.copy(), self.anchors.copy(), dict(self.caught))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it by name, as in a checkpoint."""
+        own = {f"reached_{name}": getattr(self, name).copy() for name in ("times", "poses", "anchors")}
+        return own | {f"caught_{name}": values.copy() for name, values in self.caught.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "Reached":
+        """What `arrays` gave, from among others."""
+        caught = {
+            name.removeprefix("caught_"): np.array(values) for name, values in arrays.items() if name.startswith("caught_")
+        }
+        return cls(*(np.array(arrays[f"reached_{name}"]) for name in ("times", "poses", "anchors")), caught)
 
     def pose(self, mover: Mover) -> tuple[Rotation, np.ndarray]:
         """Turn from the start, and place of the origin, (3,) m."""
@@ -214,15 +228,16 @@ class Reached:
         return Rotation.from_matrix(rotation), rotation @ (mover.origin - path.center) + path.center + p
 
 
-def soft_pins(assembly: Assembly) -> list[int]:
-    """The pins that hold by springs, in the order of `Projector.anchors`."""
-    return [number for number, pin in enumerate(assembly.pins) if pin.stiffness is not None and len(pin.vertices)]
+def anchored_pins(assembly: Assembly) -> list[int]:
+    """The pins that hold by springs to points, in the order of `Projector.anchors`."""
+    return [number for number, pin in enumerate(assembly.pins) if pin.anchored]
 
 
 class Script:
     """The movers of a simulation, and what leads them.
 
-    leads: commands, by the number of the mover; beyond these, of the pins that hold by springs. anchors: (k, 3) m, where those end.
+    leads: commands, by the key of a mover, or -1 less the number of a pin that holds by springs. anchors: (k, 3) m, where those end; on_rails: (k,)
+    bool, which hold along some axes only.
 
     target: (n,) vec3, m, where each scripted vertex goes in this outer iteration; goal: in this step. mover: (n,) int32, -1 for none.
     drive, crowded: (movers,) int32, who goes on in this outer iteration, and who has a pair that is squeezed. flags: (3,) int32, whether
@@ -234,8 +249,10 @@ class Script:
         self.assembly, self.device, self.real, self.h, self.kernels = assembly, device, real, h, kernels(real)
         self.movers, self.generation = movers_of(assembly), 0
         self.leads: dict[int, Lead] = {}
-        self.soft = soft_pins(assembly)
+        self.soft = anchored_pins(assembly)
         self.anchors: np.ndarray | None = None
+        rails = [np.full(len(assembly.pins[pin].vertices), not assembly.pins[pin].axes.all()) for pin in self.soft]
+        self.on_rails = np.concatenate([np.zeros(0, dtype=bool), *rails])
         self._ways: list[Way] = []
         self._late = ""
         n, count = len(assembly.positions), max(1, len(self.movers))
@@ -277,13 +294,7 @@ class Script:
     @property
     def moves(self) -> bool:
         """Whether anything leaves its place."""
-        return any(number < len(self.movers) for number in self.leads) or any(not mover.still for mover in self.movers)
-
-    def number_of_pin(self, pin: int) -> int:
-        """Where its command is in `leads`. pin: its place in the assembly."""
-        if pin in self.soft:
-            return len(self.movers) + self.soft.index(pin)
-        return next(number for number, mover in enumerate(self.movers) if mover.pin == pin)
+        return any(mover.key in self.leads or not mover.still for mover in self.movers)
 
     def commands(self) -> dict[str, np.ndarray]:
         """The commands as arrays by name; see `leads_of`."""
@@ -309,8 +320,8 @@ class Script:
     def rigid(self) -> list[np.ndarray]:
         """The vertices of each obstacle that moves without deforming."""
         found = []
-        for number, mover in enumerate(self.movers):
-            lead = self.leads.get(number)
+        for mover in self.movers:
+            lead = self.leads.get(mover.key)
             if mover.rigid and (not mover.still if lead is None else lead.pose is not None):
                 found.append(mover.vertices)
         return found
@@ -326,7 +337,7 @@ class Script:
         self._ways = []
         shared = []  # movers whose scripts are in time go in step with each other
         for number, mover in enumerate(self.movers):
-            lead, path = self.leads.get(number), mover.trajectory
+            lead, path = self.leads.get(mover.key), mover.trajectory
             if lead is not None:
                 way = self._led(mover, lead, reached, positions)
             elif mover.rigid and reached.times[mover.body] < time:
@@ -351,7 +362,7 @@ class Script:
         ends = np.cumsum([0, *(len(pin.vertices) for pin in pins)])
         self.anchors = np.empty((ends[-1], 3))
         for k, pin in enumerate(pins):
-            own, lead = slice(ends[k], ends[k + 1]), self.leads.get(len(self.movers) + k)
+            own, lead = slice(ends[k], ends[k + 1]), self.leads.get(-1 - self.soft[k])
             if lead is None or lead.points is None:
                 self.anchors[own] = self.assembly.pin_targets(pin, end)
             else:
@@ -368,7 +379,8 @@ class Script:
             return Way(path, 0.0, times[:MOST])
         assert lead.points is not None
         now = positions.numpy()[mover.vertices].astype(np.float64)
-        self._where[mover.vertices] = _towards(now, lead.points, within)
+        goal = lead.points if not mover.glued else mover.with_glued(lead.points)
+        self._where[mover.vertices] = _towards(now, goal, within)
         return Way(None, 0.0, np.ones(1))
 
     def _upload(self) -> None:
@@ -382,7 +394,10 @@ class Script:
             own = slice(offsets[number], offsets[number] + counts[number])
             if way.path is None:
                 continue
-            self._where[mover.vertices] = way.path.apply(mover.points, way.times[-1])
+            if way.path.is_rigid:
+                self._where[mover.vertices] = way.path.apply(mover.points, way.times[-1])
+            else:
+                self._where[mover.vertices] = mover.place(way.times[-1])
             parts[own] = (way.times - way.start) / max(way.times[-1] - way.start, 1e-300)
             if way.path.is_rigid and counts[number] > 1:
                 straight[number], centers[number] = 0, way.path.center
@@ -425,7 +440,7 @@ class Script:
             elif not mover.still:
                 now.times[mover.body] = come
                 if way.times[-1] < time:
-                    away = mover.trajectory.apply(mover.points, time) - positions.numpy()[mover.vertices]
+                    away = mover.place(time) - positions.numpy()[mover.vertices]
                     lag = max(lag, float(np.linalg.norm(away, axis=1).max(initial=0.0)))
                     why = f"and makes it up at {CATCH_UP:g} times its pace"
         return now, lag, why

@@ -606,7 +606,7 @@ class Newton:
         ties = np.concatenate(
             [np.zeros((0, 2), dtype=np.int32)]
             + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
-            + [s.elements[:, [0, corner]] for s in assembly.stitches for corner in (1, 2, 3)]
+            + [s.elements[:, [0, corner]] for s in (*assembly.stitches, *assembly.pins) for corner in (1, 2, 3)]
         )
         both = inside[ties].all(axis=1)
         joined = np.unique(assembly.body_of_vertex[ties[both]], axis=0)
@@ -687,7 +687,8 @@ class Newton:
 
     def _couplings(self) -> list:
         """What the matrix has beside the blocks of elements."""
-        return [each for each in (self.pairs, self.friction, self.model.projector.cavities) if each is not None]
+        beside = self.model.projector.cavities, self.model.projector.rail_hessian
+        return [each for each in (self.pairs, self.friction, *beside) if each is not None]
 
     # Algorithm 1, in launches only.
 

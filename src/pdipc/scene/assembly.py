@@ -17,7 +17,7 @@ from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
 from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.meshes import Mesh
-from pdipc.scene.motion import Deforming, Trajectory, rotation_matrix
+from pdipc.scene.motion import Deforming, Glue, Trajectory, rotation_matrix
 from pdipc.scene.schema import (
     Arrays,
     Attachment,
@@ -26,6 +26,7 @@ from pdipc.scene.schema import (
     ClothMaterial,
     Deformation,
     Obstacle,
+    Pin,
     Placed,
     Rod,
     RodMaterial,
@@ -99,16 +100,37 @@ class AssembledBody:
 
 @dataclass
 class AssembledPin:
-    """Held vertices (k,) int32. trajectory: how their points move. stiffness: N/m a vertex, or None: held exactly.
+    """Held vertices (k,) int32, by points (k, 3) m, where the trajectory has not moved them. stiffness: N/m a vertex, or None: held exactly.
 
-    where: the pin and its selection, for messages.
+    where: the pin and its selection, for messages. axes: (3,) bool, along which it holds. start, end: s, end may be inf; active: whether
+    it holds now. follow: the number of the body whose surface it moves with, -1 for none; held exactly, its points are those at the
+    obstacle's start, and glue says how they move with one that deforms. elements: (k, 4) int32, weights: (k, 3), of springs to a surface.
     """
 
     where: str
     body: str
     vertices: np.ndarray
+    points: np.ndarray
     trajectory: Trajectory
     stiffness: float | None
+    axes: np.ndarray = field(default_factory=lambda: np.ones(3, dtype=bool))
+    start: float = 0.0
+    end: float = np.inf
+    active: bool = True
+    follow: int = -1
+    glue: Glue | None = None
+    elements: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int32))
+    weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def exact(self) -> bool:
+        """Whether it holds vertices exactly, now."""
+        return self.active and self.stiffness is None and len(self.vertices) > 0
+
+    @property
+    def anchored(self) -> bool:
+        """Whether it holds vertices by springs to points, now."""
+        return self.active and self.stiffness is not None and self.follow < 0 and len(self.vertices) > 0
 
 
 @dataclass
@@ -216,8 +238,11 @@ class Assembly:
     def scripted(self) -> np.ndarray:
         """(n,) bool: vertices of obstacles and those that pins hold exactly."""
         mask = np.zeros(len(self.positions), dtype=bool)
-        for vertices, _ in self._scripts():
-            mask[vertices] = True
+        for body in self.bodies:
+            mask[body.first : body.last] = body.kinematic
+        for pin in self.pins:
+            if pin.exact:
+                mask[pin.vertices] = True
         return mask
 
     @property
@@ -233,8 +258,13 @@ class Assembly:
     def kinematic_positions(self, time: float) -> np.ndarray:
         """(k, 3) m: where `kinematic_vertices` are at `time` s."""
         positions = self.positions.copy()
-        for vertices, trajectory in self._scripts():
-            positions[vertices] = trajectory.apply(self.positions[vertices], time)
+        for body in self.bodies:
+            if body.trajectory is not None:
+                own = slice(body.first, body.last)
+                positions[own] = body.trajectory.apply(self.positions[own], time)
+        for pin in self.pins:
+            if pin.exact:
+                positions[pin.vertices] = self.pin_targets(pin, time)
         return positions[self.kinematic_vertices]
 
     def topology(self) -> dict[str, np.ndarray]:
@@ -252,11 +282,15 @@ class Assembly:
 
     def pin_targets(self, pin: AssembledPin, time: float) -> np.ndarray:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
-        return pin.trajectory.apply(self.positions[pin.vertices], time)
+        path = pin.trajectory if pin.follow < 0 else self.bodies[pin.follow].trajectory
+        assert path is not None
+        return path.apply(pin.points, time) if pin.glue is None else pin.glue.apply(path.apply(None, time))
 
-    def _scripts(self) -> list[tuple[np.ndarray, Trajectory | Deforming]]:
-        obstacles = [(np.arange(b.first, b.last), b.trajectory) for b in self.bodies if b.trajectory is not None]
-        return obstacles + [(pin.vertices, pin.trajectory) for pin in self.pins if pin.stiffness is None]
+    def glued(self, pin: AssembledPin, x: np.ndarray) -> Glue:
+        """How a pin's vertices move with the surface that it follows, from where both are at positions x (n, 3) m."""
+        body = self.bodies[pin.follow]
+        elements, weights = _onto(x, self.bodies[self.body_of_vertex[pin.vertices[0]]], body, pin.vertices)
+        return Glue.at(x[pin.vertices], x[body.first : body.last], elements[:, 1:] - body.first, weights)
 
 
 def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.ndarray]:
@@ -479,16 +513,6 @@ def gather(
             body.half_separation = placed.material.radius
         if isinstance(placed, Obstacle):
             body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
-        else:
-            for number, pin in enumerate(placed.pins):
-                where = f'body "{body.name}", pins[{number}]'
-                with _noting(problems):
-                    vertices = _select(assembly, body, pin.select, where)
-                    trajectory = Trajectory(pin.motion, _middle(positions[vertices]))
-                    vertices = _with_ghosts(body, vertices)
-                    where += f".select = {pin.select}"
-                    assembly.pins.append(AssembledPin(where, body.name, vertices, trajectory, pin.stiffness))
-    assembly.velocities[assembly.kinematic_vertices] = 0.0
     numbers = numbers or {}
     for number, attachment in zip(numbers.get("attachments", itertools.count()), scene.attachments, strict=False):
         with _noting(problems):
@@ -498,6 +522,11 @@ def gather(
         with _noting(problems):
             if _known(table.bodies, unread):
                 _stitch(assembly, table, f"stitches[{number}]")
+    for body, placed, *_ in parts:
+        for number, pin in enumerate(placed.pins if isinstance(placed, Body) else []):
+            with _noting(problems):
+                _pin(assembly, body, pin, f'body "{body.name}", pins[{number}]', unread)
+    assembly.velocities[assembly.kinematic_vertices] = 0.0
     for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
         with _noting(problems):
             if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
@@ -554,6 +583,8 @@ def _select(assembly: Assembly, body: AssembledBody, select: Selection, where: s
         chosen = np.flatnonzero(np.all((points >= select.box[0]) & (points <= select.box[1]), axis=1))
     elif select.sphere is not None:
         chosen = np.flatnonzero(np.linalg.norm(points - select.sphere[0], axis=1) <= select.sphere[1])
+    elif select.seam:
+        chosen = _seam(assembly, body)
     elif select.nearest is not None:
         chosen = np.array([np.argmin(np.linalg.norm(points - select.nearest, axis=1))])
     else:
@@ -620,6 +651,60 @@ def _stitch(assembly: Assembly, table: Stitch, where: str) -> None:
     assembly.stitches.append(
         AssembledStitch(where, elements, weights, stiffness, distances, length, table.start, table.duration)
     )
+
+
+def _pin(assembly: Assembly, body: AssembledBody, table: Pin, where: str, unread: set[str]) -> None:
+    vertices = _select(assembly, body, table.select, where)
+    center = _middle(assembly.positions[vertices])
+    vertices = _with_ghosts(body, vertices)
+    points = assembly.positions[vertices]
+    pin = AssembledPin(
+        f"{where}.select = {table.select}",
+        body.name,
+        vertices,
+        points,
+        Trajectory(table.motion, center),
+        table.stiffness,
+        np.array([axis in table.axes for axis in "xyz"]),
+        table.start,
+        np.inf if table.end is None else table.end,
+        table.start == 0.0,
+    )
+    if table.follow is not None:
+        if not _known([table.follow], unread):
+            return
+        surface = _body(assembly, table.follow, f"{where}.follow")
+        if surface is body:
+            raise SceneError(f"{where}.follow: {_label(body)} cannot follow itself; name another body or an obstacle")
+        if not len(surface.triangles):
+            raise SceneError(f"{where}.follow: {_label(surface)} has no surface; name a solid, a cloth or an obstacle")
+        if table.stiffness is None and not surface.kinematic:
+            raise SceneError(
+                f"{where}.follow: {_label(surface)} is simulated, and what is held exactly follows obstacles only; give the pin a stiffness"
+            )
+        pin.follow = assembly.bodies.index(surface)
+        if not np.isfinite(points).all() or not np.isfinite(assembly.positions[surface.first : surface.last]).all():
+            return  # the check says so
+        if table.stiffness is not None:
+            pin.elements, pin.weights = _onto(assembly.positions, body, surface, vertices)
+        elif isinstance(surface.trajectory, Deforming) and len(vertices):
+            pin.glue = assembly.glued(pin, assembly.positions)
+    assembly.pins.append(pin)
+
+
+def _onto(x: np.ndarray, body: AssembledBody, surface: AssembledBody, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest points of a surface to vertices (k,) of a body at positions x (n, 3) m, as `sewing.nearest`."""
+    distances, _ = cKDTree(x[np.unique(surface.triangles)]).query(x[vertices])
+    return sewing.nearest(x, body, surface, vertices, (1.0 + 1e-6) * distances.max(initial=0.0) + 1e-12, True)
+
+
+def _seam(assembly: Assembly, body: AssembledBody) -> np.ndarray:
+    """(k,) vertices of a body, counted within it, that something joins to anything."""
+    joined = [np.concatenate([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+    for each in assembly.stitches:
+        joined += [each.elements[:, 0], each.elements[:, 1:][each.weights > 0.0]]
+    vertices = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *joined]))
+    return vertices[(vertices >= body.first) & (vertices < body.last)] - body.first
 
 
 def _force(assembly: Assembly, table: Wind | VertexForce, where: str) -> None:

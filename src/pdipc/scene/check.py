@@ -96,6 +96,8 @@ def prepare(scene: Scene, assembly: Assembly, precision: str) -> None:
     if scene.contact.start == "separate" and not any(next(_numbers(assembly, body), None) for body in assembly.bodies):
         done = separate(assembly, scene.contact.start_limit)
         assembly.positions, assembly.separated = done.positions, done.moved
+        for pin in assembly.pins:
+            pin.points = done.positions[pin.vertices]
         assembly.notes += done.notes()
 
 
@@ -306,16 +308,19 @@ def _fans(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _selections(assembly: Assembly) -> Iterator[Finding]:
-    held: dict[int, str] = {}
-    for number, pin in enumerate(assembly.pins):
+    exact = []
+    for pin in assembly.pins:
         if len(pin.vertices) == 0:
             yield _nothing(assembly, pin.where, pin.body)
         elif pin.stiffness is None:
-            twice = [vertex for vertex in pin.vertices.tolist() if vertex in held]
-            if twice:
+            meanwhile = [other.vertices for other in exact if pin.start < other.end and other.start < pin.end]
+            twice = np.intersect1d(pin.vertices, np.concatenate([pin.vertices[:0], *meanwhile]))
+            if len(twice):
                 found = f"{len(twice)} vertices are held exactly by more than one pin"
+                if any(each.start > 0.0 or each.end < np.inf for each in (pin, *exact)):
+                    found += " at a time"
                 yield Finding(pin.where, found, "give them one pin, or all but one a stiffness")
-            held.update((vertex, str(number)) for vertex in pin.vertices.tolist())
+            exact.append(pin)
     for attachment in assembly.attachments:
         if len(attachment.vertices_a) == 0:
             yield Finding(attachment.where, "attaches no vertex", 'raise "within", or give pairs')

@@ -9,6 +9,7 @@ distance r of the center stays within r (w T / n)^2 / 8 of its arc. Easing only 
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -134,6 +135,41 @@ class Deforming:
         first, last = self.frames.points[after - 1].astype(np.float64), self.frames.points[min(after, len(times) - 1)]
         part = (time - times[after - 1]) / (times[after] - times[after - 1]) if len(times) > 1 else 0.0
         return (first + part * (last - first)) @ self.matrix.T + self.translation
+
+
+def pulled_back(x: np.ndarray, rotation: np.ndarray, place: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """(k, 3) m: the points of the start that a pose has at x (k, 3); place: where the pose has `center`, both (3,) m."""
+    return (x - place) @ rotation + center
+
+
+@dataclass(frozen=True)
+class Glue:
+    """Points that move with a surface: from the point of weights (k, 3) of the triangles (k, 3), vertices of the surface, by offsets
+    (k, 3) m along the first edge, across it, and along the normal.
+    """
+
+    triangles: np.ndarray
+    weights: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def at(cls, x: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, weights: np.ndarray) -> "Glue":
+        """x: (k, 3) m, where the points are while the vertices (n, 3) of the surface are there."""
+        away = x - np.einsum("ek,ekd->ed", weights, vertices[triangles])
+        return cls(triangles, weights, np.einsum("eij,ej->ei", _frames(vertices[triangles]), away))
+
+    def apply(self, vertices: np.ndarray) -> np.ndarray:
+        """(k, 3) m: where the points are when the vertices (n, 3) are there."""
+        corners = vertices[self.triangles]
+        return np.einsum("ek,ekd->ed", self.weights, corners) + np.einsum("eij,ei->ej", _frames(corners), self.offsets)
+
+
+def _frames(corners: np.ndarray) -> np.ndarray:
+    """(k, 3, 3): of triangles (k, 3, 3), the direction of the first edge, the one across it and the normal as rows."""
+    along = corners[:, 1] - corners[:, 0]
+    normal = np.cross(along, corners[:, 2] - corners[:, 0])
+    along, normal = (v / np.maximum(np.linalg.norm(v, axis=1), 1e-300)[:, None] for v in (along, normal))
+    return np.stack([along, np.cross(normal, along), normal], axis=1)
 
 
 class Approach:

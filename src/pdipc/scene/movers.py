@@ -1,11 +1,11 @@
 """What moves as told: obstacles, and the vertices that pins hold exactly; and into how many chords their turns are cut."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from pdipc.scene.assembly import Assembly
+from pdipc.scene.assembly import AssembledPin, Assembly
 from pdipc.scene.motion import Approach, Deforming, Trajectory
 
 CHORD = 0.2  # of the least separation of an obstacle's pairs: how far its chords may be from their arcs (`integration.script`)
@@ -17,6 +17,7 @@ class Mover:
     """Vertices (k,) that a script or a command leads together: an obstacle, or what a pin holds exactly.
 
     points: (k, 3) m, where they are when their trajectory has not moved them. body: which obstacle, pin: which pin, -1 for none.
+    Vertices of pins that follow an obstacle come after its own; glued: these pins.
     deviation: m, of chords. origin: (3,) m, where the mesh's origin is at the start.
     """
 
@@ -28,6 +29,22 @@ class Mover:
     pin: int
     deviation: float
     origin: np.ndarray
+    glued: list[AssembledPin] = field(default_factory=list)
+
+    @property
+    def key(self) -> int:
+        """What tells it from others: the number of its body, or of its pin, counted down from -1."""
+        return self.body if self.body >= 0 else -1 - self.pin
+
+    def place(self, time: float) -> np.ndarray:
+        """(k, 3) m: where its script has it at `time`, s."""
+        if self.trajectory.is_rigid:
+            return self.trajectory.apply(self.points, time)
+        return self.with_glued(self.trajectory.apply(None, time))
+
+    def with_glued(self, vertices: np.ndarray) -> np.ndarray:
+        """(k, 3) m: an obstacle that deforms to `vertices` (n, 3), and what is glued to it."""
+        return np.concatenate([vertices, *(pin.glue.apply(vertices) for pin in self.glued if pin.glue is not None)])
 
     @functools.cached_property
     def still(self) -> bool:
@@ -50,22 +67,22 @@ class Mover:
 
 
 def movers_of(assembly: Assembly) -> list[Mover]:
-    """The obstacles, then the pins that hold exactly."""
+    """The obstacles, then the pins that hold exactly and follow none."""
     thinnest = min(body.half_separation for body in assembly.bodies if not body.kinematic)
     found = []
     for number, body in enumerate(assembly.bodies):
         if body.trajectory is not None:
-            vertices = np.arange(body.first, body.last)
+            glued = [pin for pin in assembly.pins if pin.exact and pin.follow == number]
+            own = np.arange(body.first, body.last)
+            vertices = np.concatenate([own, *(pin.vertices for pin in glued)])
+            points = np.concatenate([assembly.positions[own], *(pin.points for pin in glued)])
             deviation = CHORD * (body.half_separation + thinnest)
             label = f'obstacle "{body.name}"'
-            found.append(
-                Mover(label, vertices, assembly.positions[vertices], body.trajectory, number, -1, deviation, body.origin)
-            )
+            found.append(Mover(label, vertices, points, body.trajectory, number, -1, deviation, body.origin, glued))
     for number, pin in enumerate(assembly.pins):
-        if pin.stiffness is None and len(pin.vertices):
-            points = assembly.positions[pin.vertices]
+        if pin.exact and pin.follow < 0:
             deviation = assembly.activation_distance
-            found.append(Mover(pin.where, pin.vertices, points, pin.trajectory, -1, number, deviation, np.zeros(3)))
+            found.append(Mover(pin.where, pin.vertices, pin.points, pin.trajectory, -1, number, deviation, np.zeros(3)))
     return found
 
 

@@ -40,6 +40,12 @@ def _no_instant(seconds: float) -> float:
     return seconds
 
 
+def _some_axes(axes: str) -> str:
+    if not axes or set(axes) - set("xyz") or len(set(axes)) < len(axes):
+        raise ValueError(f'must be one to three of the letters x, y and z, each once, such as "xz"; is "{axes}"')
+    return "".join(sorted(axes))
+
+
 def _exactly_one(table: BaseModel, *names: str) -> None:
     given = [name for name in names if getattr(table, name) not in (None, False)]
     if len(given) != 1:
@@ -543,11 +549,12 @@ class Selection(Table):
     box: tuple[Vector, Vector] | None = Field(default=None, description="Lower and upper corner, m.")
     sphere: tuple[Vector, Positive] | None = Field(default=None, description="Centre and radius, m.")
     nearest: Vector | None = Field(default=None, description="The one vertex nearest to this point, m.")
+    seam: StrictBool = Field(default=False, description="Those that stitches or attachments join to anything.")
     all: StrictBool = Field(default=False, description="Every vertex.")
 
     @model_validator(mode="after")
     def _check(self) -> "Selection":
-        _exactly_one(self, "vertices", "box", "sphere", "nearest", "all")
+        _exactly_one(self, "vertices", "box", "sphere", "nearest", "seam", "all")
         if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):
             raise ValueError(f"box: the lower corner {self.box[0]} is above the upper corner {self.box[1]}")
         return self
@@ -558,13 +565,42 @@ class Selection(Table):
 
 
 class Pin(Table):
-    """Vertices held where they start, or led along a motion, as far as nothing is in the way."""
+    """Vertices held where they are, or led along a motion or with a surface, as far as nothing is in the way.
+
+    A pin that begins later catches its vertices where they are then, and goes on from there; at its end it lets go.
+    """
 
     select: Selection = Field(description="Which vertices.")
     motion: Motion | None = Field(default=None, description="How the points that hold them move; absent: not at all.")
     stiffness: Positive | None = Field(
         default=None, description="Of the spring from each vertex to its point, N/m; absent: held exactly."
     )
+    axes: Annotated[str, AfterValidator(_some_axes)] = Field(
+        default="xyz",
+        description='Along which axes it holds; along the others its vertices are free. "y" holds a height, "xz" is a rail along y. Fewer '
+        "than three need a stiffness.",
+    )
+    follow: str | None = Field(
+        default=None,
+        description="Name of what it moves with, in place of a motion. Held exactly, vertices move as if glued to an obstacle; with a "
+        "stiffness, each hangs on the nearest point of the surface of an obstacle or another body, which feels it too.",
+    )
+    start: NotNegative = Field(default=0.0, description="When it begins to hold, s.")
+    end: Positive | None = Field(default=None, description="When it lets go, s; absent: never.")
+
+    @model_validator(mode="after")
+    def _check(self) -> "Pin":
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"end = {self.end} s must be later than start = {self.start} s")
+        if self.axes != "xyz" and self.stiffness is None:
+            raise ValueError(f'axes = "{self.axes}" needs a stiffness: what is held exactly is held along all axes')
+        if self.follow is not None and self.motion is not None:
+            raise ValueError("follow excludes motion: it moves with what it follows")
+        if self.follow is not None and self.axes != "xyz":
+            raise ValueError("follow excludes axes: it holds along all of them")
+        if self.follow is not None and self.stiffness is not None and (self.start > 0.0 or self.end is not None):
+            raise ValueError("follow with a stiffness takes no start and no end; held exactly it does")
+        return self
 
 
 class Attachment(Table):
