@@ -29,7 +29,7 @@ CLOTH = {"kind": "cloth", "mesh": {"shape": "grid", "size": [0.5, 0.5], "cells":
 def live(request):
     shown = viewer.Live(scene(**request.param), port=8700)
     yield shown
-    shown.view.server.stop()
+    shown.close()
 
 
 @pytest.mark.parametrize("host", ["999.1.1.1", "192.0.2.1"])
@@ -51,10 +51,10 @@ def test_vertices_are_updated_in_place_and_buttons_obeyed(live):
     live.running.value = False
     live.advance()
     np.testing.assert_array_equal(live.simulation.positions, moved)
-    live.todo.append(live.step)
+    live.engine.ask(live.step)
     live.advance()
     assert live.simulation.steps_done == 2
-    live.todo.append(live.reset)
+    live.engine.ask(live.reset)
     live.advance()
     assert "time 0.000 s" in live.report.content
     np.testing.assert_array_equal(meshes[0].vertices, first[live.view.skins[0].sources].astype(np.float32))
@@ -95,7 +95,7 @@ def test_what_is_held_by_pins_cannot_be_dragged(live):
 
 @pytest.mark.parametrize("live", [CLOTH], indirect=True)
 def test_an_error_in_a_step_ends_the_loop_and_is_shown(live, monkeypatch):
-    def fail():
+    def fail(forces=False):
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(live.simulation, "step", fail)
@@ -130,7 +130,7 @@ def test_playback_follows_the_clock_and_the_slider(tmp_path):
         shown.advance(0.011)  # beyond the end: from the start
         assert shown.frame.value == 0
     finally:
-        shown.view.server.stop()
+        shown.close()
 
 
 def test_the_command_serves_until_ctrl_c(monkeypatch, capsys):
@@ -139,8 +139,7 @@ def test_the_command_serves_until_ctrl_c(monkeypatch, capsys):
     def interrupted():
         raise KeyboardInterrupt
 
-    server = types.SimpleNamespace(stop=lambda: stopped.append(True))
-    view = types.SimpleNamespace(url="http://localhost:1", server=server)
-    viewer._serve(types.SimpleNamespace(view=view, loop=interrupted))
+    view = types.SimpleNamespace(url="http://localhost:1")
+    viewer._serve(types.SimpleNamespace(view=view, loop=interrupted, close=lambda: stopped.append(True)))
     assert stopped == [True]
     assert "http://localhost:1" in capsys.readouterr().out

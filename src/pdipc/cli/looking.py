@@ -273,6 +273,7 @@ def view(
             "--allow-origin", metavar="ORIGIN", help="A page elsewhere that may connect too, such as https://host:8443."
         ),
     ] = None,
+    record: Annotated[Path | None, typer.Option(metavar="DIR", help="Writes what is simulated into a new run folder.")] = None,
 ) -> None:
     """Watch a run, or a scene while it is simulated, in the browser; there, bodies can be dragged with the mouse.
 
@@ -282,6 +283,10 @@ def view(
     from pdipc.output.results import open_run
 
     if Path(what).is_dir():
+        for option, given in (("--record", record), ("--device", device)):
+            if given is not None:
+                raise typer.BadParameter(f"has no effect on {what}, a run that is played back", param_hint=option)
         viewer.play(open_run(what), host, port, allow or ())
     else:
-        viewer.simulate(load(what), host, port, device, allow or ())
+        watched = what if Path(what).is_file() else None  # an edited scene is read again; bundled ones stay as they are
+        viewer.simulate(load(what), host, port, device, allow or (), record, watched)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdipc.output import legend
+from pdipc.output.creases import split
 from pdipc.output.results import Run, RunError
 from pdipc.output.skins import Skin
 from pdipc.scene.looks import Look, Picture, looks
@@ -445,13 +446,15 @@ class _Body:
         self.number, self.kind, self.look, self.color, self.plotter = number, kind, look, color, plotter
         self.skin = skin
         self.weights: np.ndarray | None = None  # of the corners of a triangle, for points that are not vertices of the run
-        self.mesh = pyvista.PolyData.from_regular_faces(skin.points(positions), skin.triangles)
-        self.mesh["vertex"], self.mesh["point"] = skin.sources, np.arange(len(skin.sources))
         sharp = settings.sharp_edge if settings.sharp_edge is not None else 180.0 if kind == "cloth" else SHARP_EDGE
-        if 0.0 < sharp < 180.0:
-            self.mesh = self.mesh.compute_normals(split_vertices=True, feature_angle=sharp, consistent_normals=False)
         self.smooth = sharp > 0.0
-        self.vertices, self.places = np.asarray(self.mesh["vertex"]), np.asarray(self.mesh["point"])
+        points, triangles = skin.points(positions), skin.triangles
+        self.places = np.arange(len(points))  # of the skin's points, which are doubled along sharp edges
+        if 0.0 < sharp < 180.0:
+            self.places, triangles = split(points, triangles, sharp)
+        self.vertices = skin.sources[self.places]
+        self.mesh = pyvista.PolyData.from_regular_faces(points[self.places], triangles)
+        self.mesh["point"] = self.places
         self.outline: Any = None
         self.uncut = self.mesh
         self.field = drawing.field is not None
@@ -521,7 +524,7 @@ class _Body:
         else:
             self.mesh.points = np.einsum("ki,kij->kj", self.weights, positions[self.vertices])
         if self.outline is not None:
-            self.outline.points = positions[np.asarray(self.outline["vertex"])]
+            self.outline.points = self.skin.points(positions)[np.asarray(self.outline["point"])]
         if self.smooth:
             self.mesh.compute_normals(
                 cell_normals=False, inplace=True, split_vertices=False, consistent_normals=False, auto_orient_normals=False
