@@ -20,6 +20,7 @@ REFRESHED = 1.0 / 30.0  # s between two looks of the page's loop
 PLOT_EVERY = 0.3  # s between two updates of the plots
 LOOK_EVERY = 0.5  # s between two looks at the scene's file
 NOW = "newest"
+LOOKS: Any = {part: {"__all__": {"name", "look"}} for part in ("bodies", "obstacles")}
 
 
 class Live:
@@ -70,7 +71,7 @@ class Live:
 
     def _told_of_bodies(self) -> dict[str, Any]:
         names = [body.name for body in self.simulation.model.assembly.bodies]
-        return {"names": names, "looks": looks(self.engine.scene.model_dump(include={"bodies", "obstacles"}), names)}
+        return {"names": names, "looks": looks(self.engine.scene.model_dump(include=LOOKS), names)}
 
     def _panel(self, scene: Any, record: str | Path | None) -> None:
         gui, engine = self.view.server.gui, self.engine
