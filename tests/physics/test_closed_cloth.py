@@ -11,7 +11,7 @@ from physics.scenes import floor, scene, watched
 RADIUS, STRETCH = 0.1, 100.0  # m, N/m
 
 
-def balloon(inside, *, cells=10, name="balloon", stretch=STRETCH, **more):
+def balloon(inside, *, cells=8, name="balloon", stretch=STRETCH, **more):
     """A spherical membrane without bending and lateral contraction."""
     material = {"membrane_stiffness": stretch, "poisson_ratio": 0.0, "bending_stiffness": 0.0}
     mesh = {"shape": "sphere", "radius": RADIUS, "cells": cells}

@@ -161,8 +161,14 @@ def strip_table(**more):
         ({"rest": {"mesh": {"vertices": STRIP, "triangles": FACES[:3]}}}, "rest: has 3 triangles; the cloth has 4"),
         ({"rest": {"uv": True}}, "rest: uv needs a cloth whose mesh is an .obj file"),
         ({"rest": {"mesh": panels(scale=0.001)}}, r"rest: triangles\[.*in the pattern.*must correspond one to one"),
-        ({"rest": {"mesh": panels()}, "material": {"membrane": "springs"}}, "takes its rest shape from the mesh"),
-        ({"rest": {"mesh": panels()}, "material": {"bending": "curved"}}, "takes its rest shape from the mesh"),
+        (
+            {"rest": {"mesh": panels()}, "material": {"membrane": "springs"}},
+            "takes its rest shape from the mesh, and with `rest` that is another",
+        ),
+        (
+            {"rest": {"mesh": panels()}, "material": {"bending": "curved"}},
+            "takes its rest shape from the mesh, and with `rest` that is another",
+        ),
         ({"rest": {"mesh": panels(STRIP / 1.2)}, "material": {"strain_limit": 0.1}}, "starts stretched by 0.2"),
     ],
 )

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pdipc.scene import generators, meshes, pattern, rods, sewing
+from pdipc.scene import generators, meshes, pattern, rods, seams, sewing
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
@@ -461,6 +461,9 @@ def gather(
         if isinstance(placed, Cloth) and placed.rest is not None:
             with _noting(problems):
                 cut = pattern.corners_at_rest(placed, len(mesh.triangles))
+        if isinstance(placed, Cloth) and (placed.weld or placed.open_seams):
+            with _noting(problems):
+                mesh, rest, start, cut = _seamed(placed, mesh, rest, start, cut, notes)
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
@@ -545,6 +548,28 @@ def _noting(problems: list[str]) -> Iterator[None]:
 def _known(names: Iterable[str], unread: set[str]) -> bool:
     """Whether none of the bodies, or copies of bodies, is among the unread."""
     return not any(name in unread or name.rpartition("[")[0] in unread for name in names)
+
+
+def _seamed(
+    placed: Cloth, mesh: Mesh, rest: np.ndarray, start: np.ndarray, cut: np.ndarray | None, notes: list[str]
+) -> tuple[Mesh, np.ndarray, np.ndarray, np.ndarray]:
+    """Mesh, rest and start of a cloth whose seams are welded or opened, and its pattern: what it was before, where it had none."""
+    where = f'body "{placed.name}"'
+    cut = rest[mesh.triangles] if cut is None else cut
+    if placed.open_seams:
+        moved = seams.opened(start, mesh.triangles, placed.open_seams)
+        far = np.linalg.norm(moved - start, axis=1)
+        notes.append(f"{where}: {np.count_nonzero(far)} vertices on open edges were drawn back, by {far.max():.3g} m at most")
+        return mesh, moved, moved, cut
+    assert placed.weld is not None
+    number, triangles = seams.weld(start, mesh.triangles, placed.weld, f"{where}, weld")
+    count = np.bincount(number)
+    notes.append(f"{where}: {len(start) - len(count)} vertices on open edges were welded to others")
+    together = [
+        np.stack([np.bincount(number, weights=points[:, axis]) for axis in range(3)], axis=1) / count[:, None]
+        for points in (rest, start)
+    ]
+    return replace(mesh, vertices=together[0], triangles=triangles), together[0], together[1], cut
 
 
 def _copies(placed: Placed) -> list[tuple[str, np.ndarray]]:

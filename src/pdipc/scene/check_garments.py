@@ -34,10 +34,13 @@ def cloth_settings(body: Cloth, newton: bool) -> Iterator[Finding]:
                 yield Finding(
                     f"{where}: {name}", "needs the Newton solver", "leave it out, or take the barrier's contact and newton"
                 )
-    if body.rest is not None:
+    if body.weld and body.open_seams:
+        yield Finding(f"{where}: open_seams", "is given beside weld", "leave one of them out")
+    own = next((name for name in ("rest", "weld", "open_seams") if getattr(body, name) is not None), None)
+    if own is not None:
         for name, value, right in (("membrane", "springs", "strain"), ("bending", "curved", "quadratic")):
             if getattr(m, name) == value:
-                found = f'is "{value}", which takes its rest shape from the mesh and not from `rest`'
+                found = f'is "{value}", which takes its rest shape from the mesh, and with `{own}` that is another'
                 yield Finding(f"{where}: material.{name}", found, f'take "{right}"')
 
 

@@ -729,6 +729,14 @@ class Cloth(Body):
         default=None,
         description="Flat panels that it is cut from; absent: its mesh is its rest shape. The mesh is then where it starts.",
     )
+    weld: Positive | None = Field(
+        default=None,
+        description="Vertices on open edges that start no further apart than this become one, m: closes seams of panels that coincide.",
+    )
+    open_seams: Positive | None = Field(
+        default=None,
+        description="Open edges of its parts are drawn back until they are this far apart, m, for stitches to close. The rest shape stays.",
+    )
     inside: Inside | None = Field(
         default=None, description="What each closed part of it holds: a pressure, a gas or a liquid; needs the Newton solver."
     )
