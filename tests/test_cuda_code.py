@@ -10,11 +10,12 @@ from pdipc.collision import bvh, candidates, islands, patches, queries, truncati
 from pdipc.collision import moving_boxes as sweep
 from pdipc.constraints import projector
 from pdipc.device import launch as parallel
+from pdipc.device import sums
 from pdipc.device.precision import real
 from pdipc.integration import inertia
 from pdipc.integration import loads as forces
 from pdipc.linear import block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
-from pdipc.nonlinear import anderson, local_global, newton, sums
+from pdipc.nonlinear import anderson, local_global, newton
 from pdipc.paper_mode import energy_rate, printed
 from pdipc.paper_mode import targets as paper
 
