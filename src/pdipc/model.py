@@ -203,12 +203,15 @@ class Model:
 
 
 @one_at_a_time
-def build(scene: Scene, device: str | Device | None = None) -> Model:
+def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray | None = None) -> Model:
     """Assembles a scene on a device: "cpu", "cuda:0", or None for the scene's choice, else CUDA where there is one.
+
+    masses: (n,) kg of all vertices in place of those that the densities give.
 
     Raises SceneError for what `pdipc.check_scene` finds, before anything is launched.
     """
     assembly = assemble(scene)
+    assembly.masses = masses
     sim = scene.simulation
     place = device if isinstance(device, Device) else Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
@@ -231,7 +234,7 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
     free[assembly.kinematic_vertices] = False
     nonlinear = _nonlinear_solver(scene)
     sets, mass = elasticity(assembly, nonlinear == "newton")
-    mass = np.where(free, mass, 0.0)
+    mass = np.where(free, mass if assembly.masses is None else assembly.masses, 0.0)
     held = mass * (1.0 / (h * h) + sim.damping / h)
     for s in sets:
         if s.kind == "point_attachment":

@@ -31,6 +31,7 @@ EXTRAS = {
     "tetrahedralize": ("pytetwild",),
     "benchmarks": ("cholespy",),
     "sweep": ("distributed", "dask"),
+    "newton": ("newton",),
 }
 
 

@@ -17,6 +17,9 @@ class Format(StrEnum):
     """Export formats."""
 
     usd = "usd"
+    stage = "stage"
+    mdd = "mdd"
+    pc2 = "pc2"
     ply = "ply"
     obj = "obj"
     vtk = "vtk"
@@ -242,12 +245,23 @@ def _look(option: str, value: str) -> Any:
 @command()
 def export(
     folder: RunArgument,
-    to: Annotated[Format, typer.Option("--format", help="usd: one animated file; ply, obj: a file a frame; vtk: PVD and VTU.")],
+    to: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            help="usd: one animated file; stage: a layer over the USD stage that the scene's meshes came from; mdd, pc2: point caches, a "
+            "file a body; ply, obj: a file a frame; vtk: PVD and VTU.",
+        ),
+    ],
     out: Annotated[Path | None, typer.Option("--output", "-o", metavar="PATH", help="Default: beside the run folder.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Takes every so many frames.")] = 1,
     bodies: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Only this body or obstacle, with all its copies; may be given several times."),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(min=0.001, help="Frames a second of a USD file; default: the run's. Frames keep their times."),
     ] = None,
 ) -> None:
     """Write the frames of a run for other programs."""
@@ -257,8 +271,9 @@ def export(
     outside_of_runs(out)
     opened = open_run(folder)
     resolved = folder.resolve()
-    default = resolved.with_name(f"{resolved.name}.usdc" if to is Format.usd else f"{resolved.name}_{to.value}")
-    typer.echo(str(exports.export(exports.Excerpt(opened, every, bodies or None), to.value, out or default)))
+    suffix = {Format.usd: ".usdc", Format.stage: "_stage.usda"}.get(to, f"_{to.value}")
+    default = resolved.with_name(resolved.name + suffix)
+    typer.echo(str(exports.export(exports.Excerpt(opened, every, bodies or None), to.value, out or default, fps)))
 
 
 @command()

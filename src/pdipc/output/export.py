@@ -1,14 +1,13 @@
-"""The frames of a run for other programs: USD, PLY, OBJ, VTK."""
+"""The frames of a run for other programs: USD, point caches, PLY, OBJ, VTK."""
 
 from pathlib import Path
 
 import numpy as np
 
-from pdipc.output.render import OBSTACLE, PALETTE
+from pdipc.output import point_cache, usd
 from pdipc.output.results import Run, RunError
 
-FORMATS = ("usd", "ply", "obj", "vtk")
-USD_SUFFIXES = (".usd", ".usda", ".usdc")
+FORMATS = ("usd", "stage", "mdd", "pc2", "ply", "obj", "vtk")
 
 
 class Excerpt(Run):
@@ -49,18 +48,31 @@ class Excerpt(Run):
         return self._run.positions(range(self._run.frame_count)[:: self._every][frame])[self._vertices]
 
 
-def export(run: Run, to: str, path: str | Path) -> Path:
+def export(run: Run, to: str, path: str | Path, fps: float | None = None) -> Path:
     """Writes all frames of `run` in the format `to` and returns where: see the function of each format.
 
-    Raises RunError for a run without frames, ValueError for an unknown format or suffix.
+    fps: frames a second of the file, for usd. Raises RunError for a run without frames, ValueError for an unknown format or suffix,
+    or a rate that the format does not have.
     """
     if to not in FORMATS:
         raise ValueError(f'"{to}" is no export format; there are: {", ".join(FORMATS)}')
     if run.frame_count == 0:
         raise RunError(f"{run.folder} has no frames")
+    if fps is not None and to != "usd":
+        raise ValueError(f"frames a second can be chosen for usd, not for {to}")
     path = Path(path)
-    (path.parent if to == "usd" else path).mkdir(parents=True, exist_ok=True)
-    return {"usd": export_usd, "ply": export_ply, "obj": export_obj, "vtk": export_vtk}[to](run, path)
+    (path.parent if to in ("usd", "stage") else path).mkdir(parents=True, exist_ok=True)
+    if to == "usd":
+        return usd.export_usd(run, path, fps)
+    writers = {
+        "stage": usd.export_stage,
+        "mdd": point_cache.export_mdd,
+        "pc2": point_cache.export_pc2,
+        "ply": export_ply,
+        "obj": export_obj,
+        "vtk": export_vtk,
+    }
+    return writers[to](run, path)
 
 
 class _Surfaces:
@@ -123,48 +135,3 @@ def export_vtk(run: Run, folder: Path) -> Path:
         lines.append(f'<DataSet timestep="{float(run.times[frame])!r}" part="0" file="{name}"/>')
     (folder / "run.pvd").write_text("\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
     return folder / "run.pvd"
-
-
-def export_usd(run: Run, path: Path) -> Path:
-    """One .usd, .usda or .usdc file: a mesh a body below /Run, rods as tubes, points over time in seconds, y up, metres."""
-    from pxr import Gf, Usd, UsdGeom, Vt
-
-    if path.suffix.lower() not in USD_SUFFIXES:
-        raise ValueError(f'"{path}": a USD file ends in one of: {", ".join(USD_SUFFIXES)}')
-    path.unlink(missing_ok=True)
-    stage = Usd.Stage.CreateNew(str(path))
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    rate = (run.frame_count - 1) / float(run.times[-1]) if run.frame_count > 1 else 24.0
-    stage.SetTimeCodesPerSecond(rate)
-    stage.SetFramesPerSecond(rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(run.frame_count - 1)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Run").GetPrim())
-    meshes = []
-    for body, (name, kind) in enumerate(zip(run.body_names, run.body_kinds, strict=True)):
-        skin = run.skins[body]
-        triangles = skin.triangles
-        mesh = UsdGeom.Mesh.Define(stage, f"/Run/{_identifier(name, body)}")
-        mesh.GetPrim().SetMetadata("comment", name)
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles.ravel(), dtype=np.int32)))
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateDoubleSidedAttr(kind == "cloth")
-        color = OBSTACLE if kind == "obstacle" else PALETTE[body % len(PALETTE)]
-        linear = [(int(color[k : k + 2], 16) / 255.0) ** 2.2 for k in (1, 3, 5)]
-        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear)])
-        meshes.append((skin, mesh.CreatePointsAttr(), mesh.CreateExtentAttr()))
-    for frame in range(run.frame_count):
-        positions = run.positions(frame)
-        for skin, points, extent in meshes:
-            own = np.ascontiguousarray(skin.points(positions).astype(np.float32))
-            points.Set(Vt.Vec3fArray.FromNumpy(own), frame)
-            extent.Set(Vt.Vec3fArray.FromNumpy(np.array([own.min(axis=0), own.max(axis=0)])), frame)
-    stage.GetRootLayer().Save()
-    return path
-
-
-def _identifier(name: str, body: int) -> str:
-    """A USD name: letters, digits and _; the body's number keeps names apart."""
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in f"b{body}_{name}")

@@ -205,6 +205,7 @@ class Assembly:
     minimum_separation: xi of a pair whose bodies do not say otherwise, m; 0.02 d_hat unless the scene says otherwise.
     notes: what was left out of files, or converted, a line each.
     separated: where the start was separated, how far the farthest vertex of each body that was moved went, m, by name; see `pdipc.scene.separate`.
+    masses: (n,) kg, where vertices have masses of their own in place of those that densities give.
     """
 
     positions: np.ndarray
@@ -223,6 +224,7 @@ class Assembly:
     forces: list[AssembledForce] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     separated: dict[str, float] | None = None
+    masses: np.ndarray | None = None
 
     @property
     def triangles(self) -> np.ndarray:

@@ -20,7 +20,8 @@ from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
 TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
-SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", ".usd", ".usda", ".usdc")
+USD_SUFFIXES = (".usd", ".usda", ".usdc")
+SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", *USD_SUFFIXES)
 BYTES_PER_BYTE = 2  # of memory for a mesh file, at least: the file itself and its numbers
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # outward for a tet of positive volume
@@ -140,13 +141,19 @@ def center_of_mass(mesh: Mesh) -> np.ndarray:
 
 
 def locate(name: str) -> Path:
-    """The file that a scene's mesh name means: a path, or `warp:FILE` for one of the assets that come with Warp."""
+    """The file that a scene's mesh name means: a path, or `warp:FILE` for one of the assets that come with Warp; a prim stays behind it."""
     if not name.startswith("warp:"):
         return Path(name)
     spec = importlib.util.find_spec("warp")
     if spec is None or spec.origin is None:
         raise SceneError(f'mesh "{name}": Warp is not installed, so its assets are not there')
     return Path(spec.origin).parent / "examples" / "assets" / name.removeprefix("warp:")
+
+
+def split_prim(path: Path) -> tuple[Path, str | None]:
+    """The file and the prim of a name such as `shot.usda</World/Cloth>`, as USD itself writes them; None where it names no prim."""
+    file, bracket, prim = str(path).partition("<")
+    return (Path(file), prim[:-1].replace("\\", "/")) if bracket and prim.endswith(">") else (path, None)
 
 
 def read(name: str | Path, worker: Worker | None = None) -> Mesh:
@@ -192,7 +199,8 @@ def lines_from_arrays(vertices: np.ndarray, lines: np.ndarray, where: str, drop_
 
 
 def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> Contents:
-    """What a mesh file holds, before it is cut; frames: with all frames. Raises SceneError as `read` does."""
+    """What a mesh file, or a prim of one, holds, before it is cut; frames: with all frames. Raises SceneError as `read` does."""
+    path, prim = split_prim(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SceneError(
@@ -200,6 +208,8 @@ def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> 
         )
     if not is_file(path):
         raise SceneError(f'mesh file "{_short(path)}": there is no such file')
+    if prim is not None and suffix not in USD_SUFFIXES:
+        raise SceneError(f'mesh file "{_short(path)}": has no prim "{prim}"; only USD files have prims')
 
     def read() -> Contents:
         needed, free = BYTES_PER_BYTE * path.stat().st_size, free_memory()
@@ -208,7 +218,7 @@ def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> 
         if not files.is_foreign(path):
             return files.parse(path, frames)
         with contextlib.nullcontext(worker) if worker else Worker() as reader:
-            return reader.read(path, frames)
+            return reader.read(path, frames, prim)
 
     return guarded(path, read)
 

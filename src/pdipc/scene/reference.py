@@ -57,7 +57,8 @@ mesh = {{ shape = "sphere", radius = 0.3, cells = 12 }}
 
 A mesh is one of
 - a file, relative to the scene file: tets from {" ".join(TET_SUFFIXES)}, triangles from {" ".join(TRIANGLE_SUFFIXES)},
-  lines from .obj, `.npz` with V and T, F or L, and USD (with the extra "usd"); `warp:bear.usd` is the file of that name among Warp's own assets;
+  lines from .obj, `.npz` with V and T, F or L, and USD (with the extra "usd"), whole or below a prim: `shot.usda</World/Flag>`; `warp:bear.usd` is the
+  file of that name among Warp's own assets;
 - a shape, such as `{{ shape = "box", size = [1, 1, 1], cells = [4, 4, 4] }}`;
 - arrays, `{{ vertices = [...], tets = [...] }}`: in Python, NumPy arrays.
 

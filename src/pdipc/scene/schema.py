@@ -338,7 +338,8 @@ class Placed(Table):
 
     name: str = Field(min_length=1, max_length=200, description="Name, unique in the scene.")
     mesh: MeshSource = Field(
-        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp), a shape, or arrays."
+        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp; of USD also one prim, "
+        "`shot.usda</World/Flag>`), a shape, or arrays."
     )
     scale: Positive | tuple[Positive, Positive, Positive] = Field(
         default=1.0, description="Factor on the mesh's coordinates; along x, y, z if three."

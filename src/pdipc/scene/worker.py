@@ -42,15 +42,15 @@ class Worker:
     def __exit__(self, *_) -> None:
         self._end()
 
-    def read(self, path: Path, frames: bool = False) -> Contents:
+    def read(self, path: Path, frames: bool = False, prim: str | None = None) -> Contents:
         """The contents of a mesh file, as `files.parse` gives them. Raises SceneError where it fails or takes too much."""
         size = path.stat().st_size
         if self.process is not None and self.process.poll() is not None:
             self._end()
         if self.process is None and not self._start():
-            return parse(path, frames)  # a Python that cannot start another, such as one that is part of an application
+            return parse(path, frames, prim)  # a Python that cannot start another, such as one that is part of an application
         seconds, most = SECONDS + SECONDS_PER_MIB * size / 2**20, BYTES + BYTES_PER_BYTE * size
-        answer, too_much = self._ask({"path": str(path.resolve()), "frames": frames}, seconds, most)
+        answer, too_much = self._ask({"path": str(path.resolve()), "frames": frames, "prim": prim}, seconds, most)
         if answer is None:
             self._end()
             why = too_much or "the parser of this format ended its process"
@@ -135,7 +135,7 @@ def serve() -> None:
         request = json.loads(line)
         path = Path(request["path"])
         try:
-            answer: Contents | str = parse(path, request["frames"])
+            answer: Contents | str = parse(path, request["frames"], request["prim"])
         except SceneError as error:
             answer = str(error)
         except BaseException as error:

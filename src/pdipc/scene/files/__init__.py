@@ -17,13 +17,13 @@ READERS = {
 }  # fmt: skip
 
 
-def parse(path: Path, frames: bool = False) -> Contents:
+def parse(path: Path, frames: bool = False, prim: str | None = None) -> Contents:
     """The contents of a file of a known format. Raises whatever its reader does; SceneError where its message is whole.
 
-    frames: whether all frames of a USD file are wanted, which takes time.
+    Of a USD file: frames: whether all frames are wanted, which takes time; prim: path of the prim below which meshes are taken, None: all.
     """
     own = reader(path)
-    return foreign.usd(path, frames) if own is foreign.usd else own(path)
+    return foreign.usd(path, frames, prim) if own is foreign.usd else own(path)
 
 
 def reader(path: Path):

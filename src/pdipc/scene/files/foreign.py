@@ -1,6 +1,7 @@
 """Formats that other packages parse: VTK and others by meshio, glTF by trimesh, USD by its own library."""
 
 import contextlib
+import difflib
 import io
 import re
 from collections.abc import Callable
@@ -11,6 +12,8 @@ import numpy as np
 from pdipc.scene.errors import SceneError
 from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, Damaged
 from pdipc.scene.files.volumes import is_gmsh
+
+LISTED = 10  # prims that a message names
 
 
 def by_meshio(path: Path) -> Contents:
@@ -72,8 +75,10 @@ def glb(path: Path) -> Contents:
     return Contents(np.concatenate(points), [("triangle", np.concatenate(triangles))], notes=notes, repeats=True)
 
 
-def usd(path: Path, frames: bool = False) -> Contents:
-    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times."""
+def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
+    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times; below: only those of
+    the prim at this path and below it.
+    """
     try:
         from pxr import Usd, UsdGeom
     except ImportError as error:
@@ -81,7 +86,8 @@ def usd(path: Path, frames: bool = False) -> Contents:
     stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
     first = Usd.TimeCode.EarliestTime()
     prims, found, others, hidden = [], Contents(np.zeros((0, 3))), {}, 0
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+    root = stage.GetPseudoRoot() if below is None else _usd_prim(stage, path, below)
+    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
         kind = str(prim.GetTypeName())
         if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
             continue
@@ -98,7 +104,7 @@ def usd(path: Path, frames: bool = False) -> Contents:
             kind = f"{kind} without points"
         others[kind] = others.get(kind, 0) + 1
     if not prims:
-        raise SceneError(f'mesh file "{path}": holds no Mesh')
+        raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh')
     convert, said = _units(stage)
     found.points = convert(_usd_points(prims, first))
     corners, counts, size = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
@@ -127,6 +133,20 @@ def usd(path: Path, frames: bool = False) -> Contents:
     if len(times) > 1 and not frames:
         found.notes.append(_first_of(len(times)))
     return found
+
+
+def _usd_prim(stage, path: Path, wanted: str):
+    """The prim at a path. Raises SceneError, with the prims that are meshes, where there is none."""
+    from pxr import Sdf
+
+    prim = stage.GetPrimAtPath(wanted) if Sdf.Path.IsValidPathString(wanted) and Sdf.Path(wanted).IsAbsolutePath() else None
+    if prim:
+        return prim
+    there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in ("Mesh", "TetMesh")]
+    near = difflib.get_close_matches(wanted, there, n=1)
+    hint = f'; did you mean "{near[0]}"?' if near else ";"
+    listed = ", ".join(there[:LISTED]) + (", ..." if len(there) > LISTED else "")
+    raise SceneError(f'mesh file "{path}": has no prim "{wanted}"{hint} its meshes are: {listed or "none"}')
 
 
 def _usd_points(prims: list, time) -> np.ndarray:
