@@ -1,0 +1,125 @@
+"""A skirt on a dancing body: `python benchmarks/dance.py [--data FOLDER] [--steps N] [--substeps K] [--out FOLDER] [--device D]`.
+
+The body is a vertex cache of 61 frames, 1/25 s apart, and intersects itself; the skirt hangs on its hips, held by friction alone. A step is a part of a
+frame. Every outer iteration is judged by the exact witness. Writes one JSON with a line a step, and the frames for `pdipc render`.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+import pdipc
+from pdipc.output.results import RunWriter
+from pdipc.simulation import stats_of
+
+FRAMES, INTERVAL = 60, 0.04  # s
+WAIST, NARROW = (0.0, 0.9, -0.02), (0.7, 1.0, 0.7)  # where the skirt goes, m, and its scale
+
+
+def scene(data: Path, substeps: int) -> pdipc.Scene:
+    """The body and the skirt of the shared data, in SI units."""
+    skirt, body = np.load(data / "meshes/cloth/skirt_16k.npz"), np.load(data / "animated/rumba_body_61.npz")
+    cache = {"vertices": body["V"].astype(np.float64), "times": (INTERVAL * np.arange(len(body["V"]))).tolist()}
+    return pdipc.Scene(
+        title="A skirt on a dancing body",
+        simulation={"time_step": INTERVAL / substeps, "steps": FRAMES * substeps},
+        contact={"activation_distance": 2e-3, "friction": 0.4},
+        bodies=[
+            {
+                "name": "skirt",
+                "kind": "cloth",
+                "mesh": {"vertices": skirt["V"], "triangles": skirt["F"]},
+                "scale": NARROW,
+                "translation": WAIST,
+                "material": {"areal_density": 0.2, "membrane_stiffness": 1000.0, "bending_stiffness": 1e-4},
+            }
+        ],
+        obstacles=[
+            {"name": "body", "mesh": {"vertices": cache["vertices"][0], "triangles": body["F"]}, "motion": {"cache": cache}}
+        ],
+    )
+
+
+class Witness:
+    """Counts the outer iterations after which anything intersects; body triangles far from the skirt are left out."""
+
+    def __init__(self, simulation: pdipc.Simulation):
+        assembly = simulation.model.assembly
+        self.triangles, self.obstacle = simulation.triangles, assembly.obstacle
+        self.of_body = self.obstacle[self.triangles[:, 0]]
+        self.judged, self.wrong = 0, 0
+
+    def __call__(self, x, x_end) -> None:
+        x = x_end.numpy().astype(np.float64)
+        skirt, corners = x[~self.obstacle], x[self.triangles]
+        low, high = skirt.min(axis=0), skirt.max(axis=0)
+        near = ~self.of_body | (np.all(corners.min(axis=1) <= high, axis=1) & np.all(corners.max(axis=1) >= low, axis=1))
+        self.judged += 1
+        self.wrong += len(pdipc.find_intersections(x, self.triangles[near], self.obstacle)) > 0
+
+
+def stretches(rest: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(m,) the largest stretch of each triangle: its deformation's larger singular value, less 1."""
+
+    def edges(points):
+        return np.stack([points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)], axis=2)
+
+    r = np.linalg.qr(edges(rest), mode="r")
+    return np.linalg.svd(edges(x) @ np.linalg.inv(r), compute_uv=False)[:, 0] - 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("PDIPC_DATA", "../shared/data")))
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--substeps", type=int, default=2, help="Steps in a frame.")
+    parser.add_argument("--out", type=Path, default=Path("results/dance"))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--minutes", type=float, default=60.0, help="No further step is begun after so long.")
+    options = parser.parse_args()
+    made = scene(options.data, options.substeps)
+    simulation = pdipc.Simulation(made, options.device)
+    simulation.observe = witness = Witness(simulation)
+    model, steps = simulation.model, options.steps or made.simulation.steps
+    skirt = model.assembly.bodies[0]
+    topology = {"triangles": model.triangles, **model.assembly.topology()}
+    writer = RunWriter.create(
+        options.out, json.dumps({"simulation": {"steps": steps}}), topology, {"precision": model.real.name}, True
+    )
+    began, records = time.monotonic(), []
+    with writer:
+        writer.append(0, 0.0, simulation.positions, {})
+        for step in range(1, steps + 1):
+            spent = time.process_time()
+            result = simulation.step()
+            spent = time.process_time() - spent
+            stretch = stretches(model.assembly.rest_positions, simulation.positions, skirt.triangles)
+            record = {**stats_of(result), "intersecting": witness.wrong, "judged": witness.judged, "cpu_ms": 1e3 * spent}
+            record |= {"stretch": float(stretch.max()), "stretch_99.9": float(np.quantile(stretch, 0.999))}
+            records.append(record)
+            writer.append(step, simulation.state.time, simulation.positions, record)
+            print(
+                f"{step:4d} outer {result.outer:3d} {'ok' if result.converged else result.message} searches {result.searches} "
+                f"gap {1e6 * result.smallest_gap:.3g} um lag {1e3 * result.lag:.2g} mm stretch {100 * stretch.max():.1f} % "
+                f"intersecting {witness.wrong} of {witness.judged}, {sum(result.milliseconds.values()):.0f} ms in the step",
+                flush=True,
+            )
+            if time.monotonic() - began > 60.0 * options.minutes:
+                break
+    late = [k + 1 for k, record in enumerate(records) if not record["converged"]]
+    worst = max(record["stretch"] for record in records)
+    times = [sum(record["milliseconds"].values()) for record in records]
+    print(
+        f"{len(records)} steps, {len(late)} unconverged {late}, {witness.wrong} of {witness.judged} outer iterations intersect"
+    )
+    print(
+        f"largest stretch {100 * worst:.1f} %, ms a step: median {np.median(times):.0f}, mean {np.mean(times):.0f}, worst {max(times):.0f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
