@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
 import warp as wp
 
 from pdipc import algorithm
@@ -26,7 +27,8 @@ class StepResult:
     force_residual: N, the largest force on a free vertex that was left at the start of the last outer iteration, and force_scale, N, the
     largest force of inertia to compare it with; 0 for other methods than Newton's.
     lag: m, how far something scripted is behind where it should be. searches: outer iterations that were turned back because
-    the potential rose. chords: in how many straight pieces what turns was led, at most. forces: of contact, where `Simulation.step` was asked for them. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
+    the potential rose. chords: in how many straight pieces what turns was led, at most. forces: of contact, where `Simulation.step` was asked for them. quarantined: bodies that
+    ignored each other in this step. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
     CCD), barrier, misc.
     """
 
@@ -48,6 +50,7 @@ class StepResult:
     force_residual: float = 0.0
     force_scale: float = 0.0
     forces: ContactForces | None = None
+    quarantined: tuple[tuple[str, str], ...] = ()
 
     @property
     def estimated_error(self) -> float:
@@ -74,6 +77,7 @@ def step(
     work.foreign.zero_()
     model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
     work.set_scripted(state)
+    work.ignore(state.quarantined)
     if state.step % RESTRUCTURE_EVERY == 0:
         work.candidates.restructure(state.positions)
     while True:
@@ -115,12 +119,15 @@ def step(
     }[code]
     if lag > 0.0 and code not in (status.LAGGING, status.CONVERGED):
         message += f"; {behind}"
+    ignoring, left = work.quarantine.names(state.quarantined), state.quarantined
+    if ignoring:
+        left = work.quarantine.left(work.x.numpy().astype(np.float64), left)
     new = into or State(*(wp.empty_like(each) for each in (work.x, work.v, work.a, work.rest)), reached)
     wp.copy(new.positions, work.x)
     wp.copy(new.velocities, work.v)
     wp.copy(new.accelerations, work.a)
     wp.copy(new.remainders, work.rest_end)
-    new.reached, new.time, new.step = reached, time, number
+    new.reached, new.quarantined, new.time, new.step = reached, left, time, number
     return StepResult(
         state=new,
         converged=code in (status.CONVERGED, status.LAGGING),
@@ -139,6 +146,7 @@ def step(
         lag=lag,
         force_residual=report[FIRST_NUMBER + status.FORCE],
         force_scale=report[FIRST_NUMBER + status.FORCE_SCALE],
+        quarantined=ignoring,
     )
 
 
@@ -157,6 +165,7 @@ def _belongs(model: Model, state: State, work: Work) -> None:
 def _judge(model: Model, state: State, work: Work) -> None:
     assembly, triangles = model.assembly, model.triangles
     pairs = find_intersections(state.positions.numpy(), triangles, assembly.obstacle)
+    pairs = pairs[~work.quarantine.excuses(pairs, state.quarantined)]
     if len(pairs):
         work.x.fill_(wp.nan)  # so that it is judged again
         names = [assembly.bodies[body].name for body in assembly.body_of_vertex[triangles[pairs[0]][:, 0]]]

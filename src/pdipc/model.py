@@ -35,7 +35,6 @@ from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
 from pdipc.scene.schema import ClothMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
-from pdipc.scene.separate import moved_note
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -52,7 +51,7 @@ class State:
 
     positions: (n,) vec3, m. velocities: (n,) vec3, m/s. accelerations: (n,) vec3, m/s^2. remainders: (n,) vec3, m, what rounding
     took off the positions when they were stored: motions smaller than that add up. reached: how far obstacles have come, on the host.
-    time: s. step: steps done.
+    quarantined: which of the assembly's quarantined pairs still ignore each other. time: s. step: steps done.
     """
 
     positions: wp.array
@@ -60,6 +59,7 @@ class State:
     accelerations: wp.array
     remainders: wp.array
     reached: Reached
+    quarantined: tuple[bool, ...] = ()
     time: float = 0.0
     step: int = 0
 
@@ -87,6 +87,7 @@ class State:
             "accelerations": self.accelerations.numpy().copy(),
             "remainders": self.remainders.numpy().copy(),
             **self.reached.arrays(),
+            "quarantined": np.array(self.quarantined, dtype=bool),
             "time": np.float64(self.time),
             "step": np.int64(self.step),
         }
@@ -182,7 +183,10 @@ class Model:
         vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
         time = float(arrays["time"])
         reached = Reached.from_arrays(arrays) if "reached_times" in arrays else Reached.at(time, self.assembly)
-        return State(*vectors, reached, time=time, step=int(arrays.get("step", 0)))
+        quarantined = tuple(
+            bool(is_one) for is_one in arrays.get("quarantined", np.ones(len(self.assembly.quarantine), dtype=bool))
+        )
+        return State(*vectors, reached, quarantined, time=time, step=int(arrays.get("step", 0)))
 
     def set_time(self, time: float) -> None:
         """Uploads what a script says of `time`, s: how long threads are, and what closed sheets hold."""
@@ -215,9 +219,10 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     sim = scene.simulation
     place = device if isinstance(device, Device) else Device(device or sim.device)
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
+    told = len(assembly.notes)
     refuse(scene, assembly, number.name)
-    for name, far in (assembly.separated or {}).items():
-        warnings.warn(moved_note(name, far), SceneWarning, stacklevel=2)
+    for note in assembly.notes[told:]:
+        warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene, assembly, place, number)
 
 

@@ -128,6 +128,8 @@ def _merged(name: str, values: list[Any]) -> Any:
         return max(known)
     if name == "smallest_gap":
         return min(known)
+    if isinstance(last, tuple):  # the quarantined of the first: fewer later
+        return known[0]
     if isinstance(last, bool):
         return all(known)
     if isinstance(last, int):
@@ -241,7 +243,8 @@ def _run(
     if checkpoint is not None:
         simulation.state = simulation.model.state_from(checkpoint[1])
     else:
-        writer.append(0, 0.0, simulation.positions, {})
+        ignoring = simulation.work.quarantine.names(simulation.state.quarantined)
+        writer.append(0, 0.0, simulation.positions, {"quarantined": ignoring} if ignoring else {})
         writer.checkpoint(0, simulation.state.arrays())
     motions = 0
 

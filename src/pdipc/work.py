@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 
+import numpy as np
 import warp as wp
 
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
@@ -19,6 +20,7 @@ from pdipc.nonlinear import Method, status
 from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.nonlinear.newton import Newton
 from pdipc.paper_mode.printed import Printed
+from pdipc.scene.quarantine import Quarantine
 
 METHODS = {"newton": Newton, "local-global": LocalGlobal, "printed": Printed}
 
@@ -67,7 +69,9 @@ class Work:
             settings.activation_distance,
             settings.margin,
             model.rest_separation,
+            len(model.assembly.quarantine),
         )
+        self.quarantine = Quarantine(model.assembly)
         self.truncation = Truncation(device, real, n, settings.per_vertex_truncation)
         self.truncation.keep_rigid(self.script.rigid())
         self.method: Method = METHODS[settings.nonlinear_solver](self)
@@ -93,6 +97,12 @@ class Work:
                     points.assign(own)
         self.model.set_time(state.time + self.model.settings.time_step)
         self.loads.update(state.time, state.positions, state.velocities)
+
+    def ignore(self, quarantined: tuple[bool, ...]) -> None:
+        """Which of the quarantined pairs of bodies ignore each other from now on."""
+        if quarantined:
+            pairs = np.array(self.quarantine.pairs, dtype=np.int32)
+            self.candidates.ignore(np.where(np.array(quarantined)[:, None], pairs, -1))
 
     def lead(self, key: int, lead: Lead) -> None:
         """What has this key in `Script.leads` follows a command from the next step on."""

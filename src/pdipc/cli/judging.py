@@ -24,10 +24,15 @@ def check(folder: RunArgument) -> None:
     from pdipc.output.results import open_run
 
     opened = open_run(folder)
-    bad = 0
+    bad, quarantined = 0, [0, 0]
     with progress("frame", opened.frame_count) as advance:
         for frame in range(opened.frame_count):
             pairs = find_intersections(opened.positions(frame), opened.triangles, opened.obstacle)
+            excused = opened.excused(frame, pairs)
+            if opened.quarantined(frame):
+                quarantined[0] += 1
+                quarantined[1] += int(excused.any())
+            pairs = pairs[~excused]
             if len(pairs):
                 bad += 1
                 typer.echo(f"frame {frame}, t = {opened.times[frame]:g} s: {len(pairs)} pairs of triangles intersect")
@@ -36,6 +41,13 @@ def check(folder: RunArgument) -> None:
     if bad:
         fail(f"{bad} of {opened.frame_count} frames intersect")
     typer.echo(f"{opened.frame_count} frames of {len(opened.triangles)} triangles: no intersection")
+    if quarantined[0]:
+        named = " and ".join(
+            f'"{name}"' for name in dict.fromkeys(n for pair in opened.records[0].get("quarantined", ()) for n in pair)
+        )
+        typer.echo(
+            f"except of bodies in quarantine: in {quarantined[0]} frames some ignored each other ({named}), and in {quarantined[1]} they intersect"
+        )
 
 
 def _print_pairs(opened: "Run", pairs: "np.ndarray") -> None:
@@ -63,6 +75,8 @@ def certify(folder: RunArgument) -> None:
     typer.echo(f"  very close  {certificate.close} of them, told apart by exact arithmetic only")
     typer.echo(f"hits          {len(certificate.hits)}")
     typer.echo(f"smallest gap  {metres(certificate.smallest_gap)}")
+    if certificate.ignored:
+        typer.echo(f"quarantined   {certificate.ignored} pairs of bodies that ignored each other: not judged, not certified")
     typer.echo(f"time          {certificate.seconds:.1f} s")
     if certificate.hits:
         fail(f"{len(certificate.hits)} pairs meet: something passed through something")

@@ -34,6 +34,7 @@ from pdipc.device.precision import Real
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
 ROUNDING = 1.0e-5  # relative, of all that a reach is made of
 LEAST_MARGIN = 1.0e-100  # m
+IGNORED = -1.0  # the activation distance of a pair that ignores each other: it neither acts nor stops anything
 REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as minimum separation, at most
 ROD_SEPARATION = 0.7  # the same of rods, which are as thick as their radius also where they touch themselves
 
@@ -44,6 +45,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     dist = distance.functions(real)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
+    nothing = wp.constant(scalar(IGNORED))
 
     @wp.func
     def limits(
@@ -53,9 +55,18 @@ def kernels(real: Real) -> SimpleNamespace:
         half_separation: wp.array(dtype=scalar),
         rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
-        same: bool,
+        body: wp.array(dtype=wp.int32),
+        ignored: wp.array(dtype=wp.vec2i),
     ):
-        """(xi, d_hat) of a pair: smaller for a pair of one body that is close in the rest shape, so that rest is at rest."""
+        """(xi, d_hat) of a pair: smaller for a pair of one body that is close in the rest shape, so that rest is at rest; IGNORED for a
+        pair of two bodies that ignore each other.
+        """
+        low = wp.min(body[a], body[b])
+        high = wp.max(body[a], body[b])
+        same = low == high
+        for i in range(ignored.shape[0]):
+            if ignored[i][0] == low and ignored[i][1] == high:
+                return vec2(scalar(0.0), nothing)
         xi = half_separation[a] + half_separation[b]
         reach = d_hat
         if same:
@@ -74,6 +85,7 @@ def kernels(real: Real) -> SimpleNamespace:
         half_separation: wp.array(dtype=scalar),
         rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
+        ignored: wp.array(dtype=wp.vec2i),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
     ):
@@ -83,11 +95,10 @@ def kernels(real: Real) -> SimpleNamespace:
                 v = pairs[k][0]
                 t = triangles[pairs[k][1]]
                 quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
-                same = body[v] == body[t[0]]
                 rest_distance = scalar(0.0)
-                if same:
+                if body[v] == body[t[0]]:
                     rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
-                limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, same)
+                limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
     @wp.kernel(module=module)
     def edge_edge_limits(
@@ -100,6 +111,7 @@ def kernels(real: Real) -> SimpleNamespace:
         half_separation: wp.array(dtype=scalar),
         rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
+        ignored: wp.array(dtype=wp.vec2i),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
     ):
@@ -109,11 +121,10 @@ def kernels(real: Real) -> SimpleNamespace:
                 a = edges[pairs[k][0]]
                 b = edges[pairs[k][1]]
                 quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
-                same = body[a[0]] == body[b[0]]
                 rest_distance = scalar(0.0)
-                if same:
+                if body[a[0]] == body[b[0]]:
                     rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
-                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, same)
+                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
     @wp.kernel(module=module)
     def clear(first: int, away_out: wp.array(dtype=wp.int32)):
@@ -205,6 +216,7 @@ class Candidates:
     Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
     the device; what was listed is then incomplete, and the caller has to `grow` and list again.
     rest_separation: (n,) the part of its distance at rest that a pair of one body keeps at most, REST_SEPARATION where None.
+    ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
     needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
     """
 
@@ -219,8 +231,10 @@ class Candidates:
         activation_distance: float,
         margin: float,
         rest_separation: wp.array | None = None,
+        quarantined: int = 0,
     ):
         n = len(rest_positions)
+        self.ignored = wp.full(quarantined, wp.vec2i(-1, -1), dtype=wp.vec2i, device=device.warp)
         if rest_separation is None:
             rest_separation = wp.full(n, real.scalar(REST_SEPARATION), dtype=real.scalar, device=device.warp)
         self.rest_separation = rest_separation
@@ -254,6 +268,12 @@ class Candidates:
         self.begin.fill_(wp.nan)
         self.end.fill_(wp.nan)
 
+    def ignore(self, bodies: np.ndarray) -> None:
+        """Pairs (quarantined, 2) of bodies ignore each other from now on, and no others."""
+        if len(self.ignored) and not np.array_equal(self.ignored.numpy(), bodies):
+            self.ignored.assign(bodies.astype(np.int32))
+            self.invalidate()
+
     def restructure(self, x: wp.array) -> None:
         """Renews the structures of the culling around x; what they find does not depend on it."""
         self.broad_phase.restructure(x, self.half_separation)
@@ -272,7 +292,7 @@ class Candidates:
         self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
         self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
         common = [self.surface.body_of_vertex, self.rest, self.half_separation]
-        common += [self.rest_separation, self.activation_distance]
+        common += [self.rest_separation, self.activation_distance, self.ignored]
         primitives = (self.surface.triangles, self.surface.edges)
         for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
             inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]

@@ -74,7 +74,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     q = quads[k]
                     time = unit
                     shortest = wp.min(wp.min(fraction[q[0]], fraction[q[1]]), wp.min(fraction[q[2]], fraction[q[3]]))
-                    if passes[0] == 0 or shortest < scalar(1.0):
+                    if (passes[0] == 0 or shortest < scalar(1.0)) and limits[k][1] >= scalar(0.0):
                         xi = limits[k][0]
                         t = scalar(2.0)
                         if wp.static(edge_edge):

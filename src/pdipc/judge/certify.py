@@ -35,12 +35,13 @@ class Certificate:
 
     segments: motions replayed. pairs: judged, all motions together. close: those of them that
     only exact arithmetic could tell apart. smallest_gap: m, at the ends of the motions, inf where
-    nothing came near. seconds: time that it took. judge: the program that decided.
+    nothing came near. ignored: pairs of bodies in quarantine, which were not judged. seconds: time that it took. judge: the program that decided.
     """
 
     segments: int = 0
     pairs: int = 0
     close: int = 0
+    ignored: int = 0
     hits: list[Hit] = field(default_factory=list)
     smallest_gap: float = float("inf")
     seconds: float = 0.0
@@ -72,6 +73,19 @@ def certify(run: Run, progress: Callable[[int, int], None] | None = None) -> Cer
     judge = ipctk.TightInclusionCCD(tolerance=TOLERANCE * size, conservative_rescaling=1.0)
     finder = ipctk.AdditiveCCD(conservative_rescaling=0.999)  # names most pairs of a condemned motion a thousand times as fast
 
+    frame_of = {record["step"]: frame for frame, record in enumerate(run.records)}
+
+    def leave_out(candidates, quarantined: list[tuple[int, int]]) -> int:
+        """Takes the candidates out whose bodies ignore each other; returns how many."""
+        before = len(candidates)
+        for kind in ("vv_candidates", "ev_candidates", "ee_candidates", "fv_candidates"):
+            listed = list(getattr(candidates, kind))
+            vertices = [used[[v for v in each.vertex_ids(edges, triangles) if v >= 0]] for each in listed]
+            bodies = [run.topology["body_of_vertex"][each] for each in vertices]
+            kept = [each for each, b in zip(listed, bodies, strict=True) if (int(b.min()), int(b.max())) not in quarantined]
+            setattr(candidates, kind, kept)
+        return before - len(candidates)
+
     def named(candidate) -> str:
         vertices = used[[vertex for vertex in candidate.vertex_ids(edges, triangles) if vertex >= 0]]
         bodies = dict.fromkeys(run.body_names[body] for body in run.topology["body_of_vertex"][vertices].tolist())
@@ -83,6 +97,8 @@ def certify(run: Run, progress: Callable[[int, int], None] | None = None) -> Cer
         candidates = ipctk.Candidates()
         candidates.build(mesh, x, x_end, 0.5 * near, ipctk.LBVH())
         certificate.segments += 1
+        if quarantined := run.quarantined(frame_of[step]):
+            certificate.ignored += leave_out(candidates, quarantined)
         certificate.pairs += len(candidates)
         if not candidates.is_step_collision_free(mesh, x, x_end, 0.0, judge):
             accused = []

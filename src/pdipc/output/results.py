@@ -283,6 +283,18 @@ class Run:
             )
         return found.astype(np.float64)
 
+    def quarantined(self, frame: int) -> list[tuple[int, int]]:
+        """Pairs of bodies, by ascending numbers, that ignored each other in the step that led to `frame`, so that they may intersect in it."""
+        numbers = {name: number for number, name in enumerate(self.body_names)}
+        named = self.records[frame].get("quarantined", ())
+        return [tuple(sorted(numbers[name] for name in pair)) for pair in named]
+
+    def excused(self, frame: int, pairs: np.ndarray) -> np.ndarray:
+        """(k,) bool: which pairs (k, 2) of triangles belong to bodies that ignored each other in the step that led to `frame`."""
+        owner = np.sort(self.body_of_triangle[pairs], axis=1)
+        found = [np.all(owner == pair, axis=1) for pair in self.quarantined(frame)]
+        return np.any(found, axis=0) if found else np.zeros(len(pairs), dtype=bool)
+
     def forces(self, frame: int) -> ContactForces | None:
         """Forces of contact in the step that led to `frame`; None at the start and where none were recorded.
 
@@ -460,6 +472,10 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(name, str) for name in value)
+
+
 # What readers rely on in a line of stats.jsonl; a step may tell more.
 STEP, TIME = (
     ("a whole number that rises from line to line", _is_count),
@@ -472,6 +488,7 @@ FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "outer": ("a whole number", _is_count),
     "barriers": ("a whole number", _is_count),
     "message": ("text", lambda value: isinstance(value, str)),
+    "quarantined": ("a list of pairs of names", lambda value: isinstance(value, list) and all(map(_is_pair, value))),
     "milliseconds": ("a table of numbers", lambda value: isinstance(value, dict) and all(map(_is_number, value.values()))),
 }
 

@@ -206,6 +206,7 @@ class Assembly:
     notes: what was left out of files, or converted, a line each.
     separated: where the start was separated, how far the farthest vertex of each body that was moved went, m, by name; see `pdipc.scene.separate`.
     masses: (n,) kg, where vertices have masses of their own in place of those that densities give.
+    quarantine: pairs of bodies, by their numbers, that ignore each other until they have parted; see `pdipc.scene.quarantine`.
     """
 
     positions: np.ndarray
@@ -225,6 +226,7 @@ class Assembly:
     notes: list[str] = field(default_factory=list)
     separated: dict[str, float] | None = None
     masses: np.ndarray | None = None
+    quarantine: list[tuple[int, int]] = field(default_factory=list)
 
     @property
     def triangles(self) -> np.ndarray:
@@ -527,6 +529,10 @@ def gather(
         with _noting(problems):
             if _known(table.bodies, unread):
                 _stitch(assembly, table, f"stitches[{number}]")
+    for number, pair in enumerate(scene.contact.quarantine):
+        with _noting(problems):
+            if _known(pair, unread):
+                assembly.quarantine.append(_quarantined(assembly, pair, f"contact.quarantine[{number}]"))
     for body, placed, *_ in parts:
         for number, pin in enumerate(placed.pins if isinstance(placed, Body) else []):
             with _noting(problems):
@@ -631,6 +637,16 @@ def _in_range(body: AssembledBody, vertices: list[int], where: str) -> None:
     beyond = [vertex for vertex in vertices if not 0 <= vertex < count]
     if beyond:
         raise SceneError(f"{where}: vertex {beyond[0]} is out of range; {_label(body)} has the vertices 0 to {count - 1}")
+
+
+def _quarantined(assembly: Assembly, names: tuple[str, str], where: str) -> tuple[int, int]:
+    bodies = [_body(assembly, name, where) for name in names]
+    if bodies[0] is bodies[1]:
+        raise SceneError(f"{where}: {_label(bodies[0])} cannot ignore itself; name two bodies")
+    if all(body.kinematic for body in bodies):
+        raise SceneError(f"{where}: obstacles ignore each other always; name at least one body")
+    a, b = sorted(assembly.bodies.index(body) for body in bodies)
+    return a, b
 
 
 def _label(body: AssembledBody) -> str:

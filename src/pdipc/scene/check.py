@@ -18,6 +18,7 @@ from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import MOST, most_chords, movers_of
+from pdipc.scene.quarantine import Quarantine
 from pdipc.scene.schema import Cloth, Rod, Scene, local_global_settings, uses_newton
 from pdipc.scene.separate import separate
 
@@ -99,6 +100,15 @@ def prepare(scene: Scene, assembly: Assembly, precision: str) -> None:
         for pin in assembly.pins:
             pin.points = done.positions[pin.vertices]
         assembly.notes += done.notes()
+    if assembly.quarantine:
+        quarantine = Quarantine(assembly)
+        left = quarantine.left(assembly.positions, (True,) * len(assembly.quarantine))
+        assembly.quarantine = [pair for pair, is_left in zip(assembly.quarantine, left, strict=True) if is_left]
+        assembly.notes += [
+            f'"{a}" and "{b}" '
+            + ("start in each other and ignore each other until they part" if is_left else "start apart: no quarantine")
+            for is_left, (a, b) in zip(left, quarantine.names((True,) * len(left)), strict=True)
+        ]
 
 
 def fit_defaults(scene: Scene, assembly: Assembly, precision: str) -> None:
@@ -401,9 +411,11 @@ def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, i
     triangles = assembly.triangles
     pairs = find_intersections(assembly.positions, triangles, assembly.obstacle)
     owners = np.sort(assembly.body_of_vertex[triangles[pairs][:, :, 0]], axis=1)
-    findings, touching = [], set()
+    findings, touching = [], set(assembly.quarantine)
     tried = assembly.separated is not None
     for i, j in np.unique(owners, axis=0):
+        if (int(i), int(j)) in assembly.quarantine:
+            continue
         own = pairs[np.all(owners == (i, j), axis=1)]
         corners = assembly.positions[triangles[own[0]]]
         where = _label(assembly.bodies[i]) + (f" and {_label(assembly.bodies[j])}" if i != j else "")
@@ -413,6 +425,8 @@ def _intersections(assembly: Assembly, precision: str) -> tuple[set[tuple[int, i
         found += f" ({what} {numbers}{', ...' if len(own) > LISTED else ''})"
         right = "move them apart" if i != j else "the surface must not pass through itself"
         right += "; raising contact.start_limit may help" if tried else ', or take contact.start = "separate"'
+        if i != j:
+            right += "; contact.quarantine lets them ignore each other until they part"
         findings.append(Finding(where, found, right))
         touching.add((int(i), int(j)))
     return touching, findings

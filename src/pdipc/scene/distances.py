@@ -2,6 +2,7 @@
 
 import numpy as np
 
+ALMOST_CLOSED = 0.05  # part of a surface's edges that may be its border, for it to enclose space
 PART = 1 << 21  # points times triangles that are looked at together
 
 
@@ -50,3 +51,13 @@ def winding_numbers(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
         volume = np.einsum("kmi,kmi->km", a, np.cross(b, c))
         found.append(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2.0 * np.pi))
     return np.concatenate(found)
+
+
+def encloses(positions: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether a surface of triangles (m, 3) encloses space: it faces outward and hardly has a border. Segments (a, b, b) do not."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(sides, axis=0, return_counts=True)
+    corners = positions[triangles]
+    corners = corners - corners.mean(axis=(0, 1))
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return bool(np.count_nonzero(counts == 1) <= ALMOST_CLOSED * len(counts) and volume > 0.0)

@@ -184,6 +184,12 @@ class Contact(Table):
         description='How far "separate" may move a vertex, m; absent: a tenth of the largest body\'s size.',
     )
 
+    quarantine: list[tuple[str, str]] = Field(
+        default=[],
+        description="Pairs of bodies, by name, that may intersect at the start: such a pair ignores each other until it has parted, and every result "
+        "says so. Copies are `name[0]`, ...",
+    )
+
     @model_validator(mode="after")
     def _check_start(self) -> "Contact":
         if self.start_limit is not None and self.start != "separate":

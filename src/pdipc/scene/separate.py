@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 
 from pdipc.judge import boxes
 from pdipc.judge.witness import edge_triangle_crossings, find_intersections
-from pdipc.scene.assembly import AssembledBody, Assembly
-from pdipc.scene.distances import closest_on_segments, closest_on_triangles, winding_numbers
+from pdipc.scene.assembly import Assembly
+from pdipc.scene.distances import closest_on_segments, closest_on_triangles, encloses, winding_numbers
 
 MOST = 150  # rounds
 PATIENCE = 30  # rounds without fewer crossings, then it ends
@@ -30,7 +30,6 @@ LIMIT = 0.1  # of the largest body's size: default bound of displacements
 SOLID_WEIGHT = 0.1  # how readily a solid moves, beside cloth
 NEAREST = 12  # triangles of which the nearest is looked for, by their middles
 SPREAD = 0.5  # how much of its neighbours' displacement a vertex takes over in a round
-ALMOST_CLOSED = 0.05  # part of a surface's edges that may be its border, for it to enclose space
 HURRY = 1.5  # times the mean of what a solid's vertices ask for: the deepest ask for more than the mean
 NEAR = 1.2  # of the minimum separation: pairs that start nearer are put apart, too
 
@@ -49,12 +48,10 @@ class Separation:
 
     def notes(self) -> list[str]:
         """A line for each body that was moved."""
-        return [moved_note(name, far) for name, far in self.moved.items()]
-
-
-def moved_note(name: str, far: float) -> str:
-    """That a body was moved at the start, and how far, m."""
-    return f'body "{name}": moved by up to {far:.3g} m, so that nothing intersects or is too near at the start'
+        return [
+            f'body "{name}": moved by up to {far:.3g} m, so that nothing intersects or is too near at the start'
+            for name, far in self.moved.items()
+        ]
 
 
 def separate(assembly: Assembly, limit: float | None = None) -> Separation:
@@ -81,7 +78,7 @@ class _Separator:
         self.rigid = loose[self.owner]
         self.half = np.array([body.half_separation for body in assembly.bodies])[self.owner]
         self.gap = GAP * assembly.activation_distance
-        self.encloses = [_encloses(assembly, body) for body in assembly.bodies]
+        self.encloses = [encloses(assembly.positions, body.triangles) for body in assembly.bodies]
         self.mean = _neighbour_mean(assembly)
         self.pushed = np.zeros(len(self.x), dtype=bool)
 
@@ -296,18 +293,6 @@ class _Separator:
         far = np.linalg.norm(moved, axis=1)
         moved *= np.minimum(1.0, self.limit / np.maximum(far, 1e-300))[:, None]
         self.x = self.assembly.positions + moved
-
-
-def _encloses(assembly: Assembly, body: AssembledBody) -> bool:
-    """Whether a surface encloses space: it faces outward and hardly has a border."""
-    if body.kind == "rod":
-        return False
-    sides = np.sort(body.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, counts = np.unique(sides, axis=0, return_counts=True)
-    corners = assembly.positions[body.triangles]
-    corners = corners - corners.mean(axis=(0, 1))
-    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    return bool(np.count_nonzero(counts == 1) <= ALMOST_CLOSED * len(counts) and volume > 0.0)
 
 
 def _neighbour_mean(assembly: Assembly) -> scipy.sparse.csr_array:
