@@ -16,8 +16,7 @@ from pdipc.collision import queries
 from pdipc.device.launch import Device
 from pdipc.device.precision import real
 from pdipc.drive import Work, step
-from pdipc.reproduce import _common, fig8
-from pdipc.reproduce.armadillo import authors_scene
+from pdipc.reproduce import _common, _scenes, fig8
 from pdipc.reproduce.fig7 import Run, loads, table_cloth
 from pdipc.scene.load import bundled_scenes
 
@@ -53,8 +52,7 @@ def bundled_cases(small: bool) -> list[str]:
 def scene_of(case: str) -> pdipc.Scene | None:
     """None for the Armadillo where the optional data is not there."""
     if case == ARMADILLO:
-        path = _common.data("paper_armadillo/placed.npz")
-        return None if path is None else authors_scene(path)
+        return None if _common.data("paper_armadillo/placed.npz") is None else _scenes.armadillo()
     return pdipc.load_scene(case) if case in bundled_scenes() else peer_scenes.scene(case)
 
 

@@ -11,8 +11,9 @@ pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
 
 from pdipc.device.launch import Device
 from pdipc.output.results import open_run
-from pdipc.reproduce import _common, armadillo, fig9, fig10, fig12
+from pdipc.reproduce import _common, _snapshots, fig9, fig10, fig12, fig13
 from pdipc.scene import meshes
+from pdipc.scene.load import load_scene
 
 
 @pytest.fixture(autouse=True)
@@ -102,23 +103,37 @@ def test_fig12(tmp_path, capsys):
     assert np.linalg.norm(x - y, axis=1).mean() < 3e-3 * size
 
 
-def test_armadillo(tmp_path, capsys):
-    """The stand-in says that it is one; cloth comes to lie on the body, and nothing intersects."""
-    picture = armadillo.run(tmp_path, small=True, device="cpu")
-    told = capsys.readouterr().out
-    check_files(picture, told)
-    assert "stand-in" in told
-    paper, here = rows(tmp_path / "armadillo.csv")
-    assert paper["outer"] == "10" and paper["FPS"] == "19.4 to 112.0"
-    assert here["bodies"] == "3" and int(here["barriers"]) > 0
-    steps = rows(tmp_path / "armadillo_steps.csv")
-    assert all(int(row["intersections"]) == 0 for row in steps)
-    assert max(int(row["barriers"]) for row in steps) > 50
+def test_snapshots(tmp_path, capsys, monkeypatch):
+    """A figure of two rows: each is run once, judged at every frame, and drawn as a line of panels; a large picture goes on top."""
+    from matplotlib.image import imread
+
+    begun = []
+
+    def shortened(name):
+        scene = load_scene(name)
+        scene.simulation.steps = 2
+        begun.append(name)
+        return scene
+
+    monkeypatch.setattr(_snapshots, "load_scene", shortened)
+    monkeypatch.setattr(_snapshots, "PANEL", (160, 120))
+    monkeypatch.setattr(_snapshots, "WIDE", (300, 200))
+    check_files(fig13.run(tmp_path, small=True, device="cpu"), capsys.readouterr().out)
+    assert begun == ["dragon", "armadillo"]
+    image = imread(tmp_path / "fig13.png")
+    assert image.shape[:2] == (2 * 120 + _snapshots.GAP, 4 * 160 + 3 * _snapshots.GAP)
+    found = rows(tmp_path / "fig13.csv")
+    assert [row["row"] for row in found] == ["dragon", "dragon", "armadillo", "armadillo"]
+    assert all(row["intersections"] == "0" and row["converged"] == "True" for row in found)
+    stacked = _snapshots._stacked([np.zeros((20, 30, 3), dtype=np.uint8), np.zeros((10, 12, 3), dtype=np.uint8)])
+    assert stacked.shape == (30 + _snapshots.GAP, 30, 3)
+    assert np.all(stacked[20 : 20 + _snapshots.GAP] == 255) and np.all(stacked[-10:, :9] == 255)
+    assert np.all(stacked[-10:, 9:21] == 0)
 
 
 def test_a_stopped_figure_goes_on_where_it_was(tmp_path):
     """The same bits as without a stop; a run of another scene is begun anew."""
-    scene = armadillo.stand_in()
+    scene = load_scene("armadillo")
     scene.simulation.steps = 3
     whole = _common.simulated(scene, tmp_path / "whole", "whole", "cpu").positions(-1)
     part = tmp_path / "part"

@@ -18,7 +18,7 @@ from pdipc.reproduce import _common, _filled, _scenes, table1
 from pdipc.scene.assembly import assemble
 from pdipc.scene.check import check
 from pdipc.scene.load import load_scene
-from pdipc.scene.meshes import tet_volumes
+from pdipc.scene.meshes import boundary, tet_volumes, triangle_areas
 
 TABLE = {  # bodies, degrees of freedom, elements: Table 1 of the paper
     "dinosaur": (4, 69e3, 103e3),
@@ -130,3 +130,17 @@ def test_filled(tmp_path, monkeypatch):
     monkeypatch.setattr(_filled, "stuffed", None)
     np.testing.assert_array_equal(_filled.filled(7.0 * body.vertices, triangles, 2000, "turtle")["tets"], mesh["tets"])
     assert kept.is_file()
+
+
+def test_a_finer_surface_keeps_the_shape():
+    """So many more vertices, all on the surface; volume and area stay, and neighbours still match."""
+    body = load_scene("dragon").bodies[0].mesh.model_copy(update={"name": "pig", "cells": 10}).mesh()
+    points, tets = _filled.with_finer_surface(body.vertices, body.tets, 500)
+    assert len(points) == len(body.vertices) + 500
+    volumes = tet_volumes(points, tets)
+    assert volumes.min() > 0.0
+    assert volumes.sum() == pytest.approx(tet_volumes(body.vertices, body.tets).sum())
+    surface = boundary(tets)
+    assert len(surface) == len(body.triangles) + 2 * 500
+    assert triangle_areas(points, surface).sum() == pytest.approx(triangle_areas(body.vertices, body.triangles).sum())
+    assert set(range(len(body.vertices), len(points))) <= set(surface.ravel().tolist())
