@@ -237,3 +237,16 @@ def test_what_a_file_cannot_hold_is_refused(run, tmp_path):
         rendering.render_animation(run, tmp_path / "a.gif", Picture(background="transparent"))
     with pytest.raises(IndexError, match="has no frame 7"):
         rendering.render(run, 7, tmp_path / "a.png")
+
+
+def test_shading_turns_with_the_body(run):
+    """The normals of a ball point away from its middle, also after it has turned."""
+    with rendering.drawing(run, [0], Picture(size=SIZE)) as picture:
+        (ball,) = (body for body in picture.bodies if getattr(body, "kind", None) == "solid")
+        start, middle = run.positions(0), np.array([0.0, 0.3, 0.0])
+        turned = (start - middle) @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]) + middle
+        for positions in (start, turned):
+            ball.move(positions)
+            out = np.asarray(ball.mesh.points) - middle
+            out /= np.linalg.norm(out, axis=1, keepdims=True)
+            assert np.einsum("ij,ij->i", out, np.asarray(ball.mesh.point_data["Normals"])).min() > 0.9

@@ -526,6 +526,8 @@ class _Body:
         if self.outline is not None:
             self.outline.points = self.skin.points(positions)[np.asarray(self.outline["point"])]
         if self.smooth:
+            for data in (self.mesh.point_data, self.mesh.cell_data):
+                data.pop("Normals", None)  # VTK keeps those that are there
             self.mesh.compute_normals(
                 cell_normals=False, inplace=True, split_vertices=False, consistent_normals=False, auto_orient_normals=False
             )
