@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import exact
 import hard_queries
 import numpy as np
 import scipy.sparse.linalg as spla
@@ -251,20 +252,27 @@ def ccd_queries(kind: str, precision: str) -> np.ndarray:
     return np.concatenate([family(rng, QUERIES) for family in families]).astype(np.float32).astype(precision)
 
 
-def ccd_times(kind: str, precision: str, device: str) -> np.ndarray:
-    return pdipc.time_of_impact(ccd_queries(kind, precision), kind, precision=precision, device=device)
+def ccd_times(points: np.ndarray, kind: str, precision: str, device: str) -> np.ndarray:
+    return pdipc.time_of_impact(points, kind, precision=precision, device=device)
 
 
 def check_ccd(report, place: Device, case: str, carried: Path | None) -> None:
-    """Times of impact of random and hard queries against the CPU's, which the tests prove to be early."""
+    """Times of impact of random and hard queries: each is proven, in exact arithmetic where rounded does not do, to be early.
+
+    With the CPU's they agree but for queries so hard that rounding decides whether a proof is found: CUDA fuses multiplications and
+    additions, the CPU does not.
+    """
     kept = Kept(carried)
     for kind in ("vertex_triangle", "edge_edge"):
-        here = ccd_times(kind, case, place.name)
-        same = kept.get(f"ccd {kind} {case}", functools.partial(ccd_times, kind, case, "cpu"))
+        points = kept.get(f"ccd queries {case}", lambda: ccd_queries(kind, case))
+        here = ccd_times(points, kind, case, place.name)
+        same = kept.get(f"ccd {kind} {case}", functools.partial(ccd_times, points, kind, case, "cpu"))
         both = np.isfinite(here) & np.isfinite(same)
-        report.check(f"{kind}, hit on one side only", np.mean(np.isfinite(here) != np.isfinite(same)), 1e-4)
+        report.check(f"{kind}, hit on one side only", np.mean(np.isfinite(here) != np.isfinite(same)), 1e-3)
         report.check(f"{kind}, times apart", np.abs(here[both] - same[both]).max(initial=0.0), 1e-3)
-        report.check(f"{kind}, hits before 0.9 missed", np.count_nonzero(np.isinf(here) & (same < 0.9)), 0)
+        moving = np.flatnonzero(here > 0.0)
+        apart = exact.stays_apart(points[moving], kind, np.minimum(here[moving], 1.0))
+        report.check(f"{kind}, times of {len(moving)} that are not proven early", np.count_nonzero(~apart), 0)
 
 
 def solver_cases(small: bool) -> list[str]:
@@ -336,8 +344,9 @@ def prepare(folder: Path, arch: int | None, small: bool, parts: str) -> None:
         except pdipc.SceneError as error:
             print(f"{case}: left out: {error}", flush=True)
     for precision in PRECISIONS:
+        found[f"ccd queries {precision}"] = ccd_queries("", precision).astype(np.float32)
         for kind in ("vertex_triangle", "edge_edge"):
-            found[f"ccd {kind} {precision}"] = ccd_times(kind, precision, "cpu")
+            found[f"ccd {kind} {precision}"] = ccd_times(found[f"ccd queries {precision}"], kind, precision, "cpu")
         for name, results in KERNELS.items():
             found |= {f"{name} {precision}: {key}": value for key, value in results(Device("cpu"), precision).items()}
     np.savez(path, **found)

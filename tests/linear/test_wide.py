@@ -60,7 +60,7 @@ def test_motions_that_a_group_does_not_have(wide):
     here, there = (wp.array(each.ravel(), dtype=wp.float64, device="cpu") for each in (c, np.zeros_like(c)))
     lead = wp.array(np.where(np.isin(np.arange(size), gone), 1.0, np.diag(c)), dtype=wp.float64, device="cpu")
     for pivot in range(groups):
-        place.launch(k.eliminate, size * groups, [groups, pivot, lead, here, there])
+        place.launch(k.eliminate, 2 * size, [groups, 2, pivot, lead, here, there])
         here, there = there, here
     kept = np.setdiff1d(np.arange(size), gone)
     expected = np.zeros_like(c)

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.launch import Span
@@ -430,7 +431,7 @@ class BarrierTerm(ActivePairs):
         o = operator(self.real).Operand()
         for name in ("count", "quads", "weights", "normals", "lever", "hessian", "bend", "first_bent", "second_bent"):
             setattr(o, name, getattr(self, name))
-        o.project, o.ends, o.entries, o.response, o.across = self.project, self.ends, self.entries, self.felt, self.across
+        o.project, o.ends, o.places, o.shares = self.project, self.ends, self.places, self.shares
         return o
 
 
@@ -439,7 +440,7 @@ def operator(real: Real) -> Operator:
     """The Hessian for the kernels of `wide_pcg`."""
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
     k_of = kernels(real)
-    mat43, feel_pair, exert_pairs = k_of.mat43, k_of.feel, k_of.exert
+    mat43, feel_pair, row, total_share = k_of.mat43, k_of.feel, k_of.row, pairs.total_share(real)
 
     @wp.struct
     class Operand:
@@ -454,9 +455,8 @@ def operator(real: Real) -> Operator:
         second_bent: wp.array(dtype=mat43)
         project: wp.array(dtype=wp.int32)
         ends: wp.array(dtype=wp.int32)
-        entries: wp.array(dtype=wp.int32)
-        response: wp.array(dtype=vec3)
-        across: wp.array(dtype=vec3)
+        places: wp.array(dtype=wp.int32)
+        shares: wp.array(dtype=vec3)
 
     @wp.func
     def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
@@ -473,15 +473,17 @@ def operator(real: Real) -> Operator:
             o.second_bent,
             o.project,
         )
-        o.response[k] = response
-        o.across[k] = across
+        for s in range(4):
+            share = response[0] * row(o.lever[k], s)
+            if o.project[0] == 0:
+                share += o.weights[k][s] * across
+                share += response[1] * row(o.first_bent[k], s) + response[2] * row(o.second_bent[k], s)
+            o.shares[o.places[4 * k + s]] = share
         return work
 
     @wp.func
     def exert(o: Operand, v: int) -> vec3:
-        return exert_pairs(
-            v, o.ends, o.entries, o.weights, o.lever, o.first_bent, o.second_bent, o.project, o.response, o.across
-        )
+        return total_share(v, o.ends, o.shares)
 
     return Operator(Operand, feel, exert)
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
@@ -65,6 +66,16 @@ def kernels(real: Real) -> SimpleNamespace:
         ends_out[i] = ends[i]
         if i == 0:
             count_out[0] = count[0]
+
+    @wp.kernel(module=module)
+    def copy_places(
+        span: Span, count: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32), places_out: wp.array(dtype=wp.int32)
+    ):
+        worker = span.first + wp.tid()
+        for b in range(worker * span.block, count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, count[0])):
+                for s in range(4):
+                    places_out[4 * k + s] = places[4 * k + s]
 
     @wp.func
     def slip(q: wp.vec4i, a: vec4, n: vec3, u: wp.array(dtype=vec3)) -> vec3:
@@ -219,6 +230,7 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(
         copy=copy,
         copy_ends=copy_ends,
+        copy_places=copy_places,
         evaluate=evaluate,
         gather=gather,
         stretch=stretch,
@@ -258,6 +270,8 @@ class FrictionTerm:
         self.entries = make(wp.int32, 4 * capacity)
         self.energy_of_pair, self.force, self.block = make(wp.float64), make(real.vec3), make(real.mat33)
         self.response = make(real.vec3)
+        wide = 4 * capacity if self.device.wide else 1
+        self.places, self.shares = make(wp.int32, wide), make(real.vec3, wide)
 
     def lag(self) -> None:
         """Launches the copy of the barrier's pairs, with the normal forces that they have now."""
@@ -265,6 +279,8 @@ class FrictionTerm:
         device.launch(k.copy_ends, len(self.ends), [s.count, s.ends, self.count, self.ends])
         inputs = [s.count, s.quads, s.weights, s.normals, s.gaps, s.activation, s.stiffness, s.coefficient, s.entries]
         device.launch_list(k.copy, self.capacity, [*inputs, self.quads, self.weights, self.normals, self.limit, self.entries])
+        if device.wide:
+            device.launch_list(k.copy_places, self.capacity, [s.count, s.places, self.places])
 
     def differentiate(self, u: wp.array, project: wp.array) -> None:
         """Launches energy, force and Hessian at the displacements u since the start of the step; project: (1,) int32, whether the Hessian
@@ -299,7 +315,7 @@ class FrictionTerm:
     def operand(self):
         """What the functions of `operator` work on."""
         o = operator(self.real).Operand()
-        for name in ("count", "quads", "weights", "block", "ends", "entries", "response"):
+        for name in ("count", "quads", "weights", "block", "ends", "places", "shares"):
             setattr(o, name, getattr(self, name))
         return o
 
@@ -308,7 +324,7 @@ class FrictionTerm:
 def operator(real: Real) -> Operator:
     """As in `exact`."""
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
-    feel_pair, exert_pairs = kernels(real).feel, kernels(real).exert
+    feel_pair, total_share = kernels(real).feel, pairs.total_share(real)
 
     @wp.struct
     class Operand:
@@ -317,18 +333,19 @@ def operator(real: Real) -> Operator:
         weights: wp.array(dtype=vec4)
         block: wp.array(dtype=mat33)
         ends: wp.array(dtype=wp.int32)
-        entries: wp.array(dtype=wp.int32)
-        response: wp.array(dtype=vec3)
+        places: wp.array(dtype=wp.int32)
+        shares: wp.array(dtype=vec3)
 
     @wp.func
     def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
         response, work = feel_pair(k, p, o.quads, o.weights, o.block)
-        o.response[k] = response
+        for s in range(4):
+            o.shares[o.places[4 * k + s]] = o.weights[k][s] * response
         return work
 
     @wp.func
     def exert(o: Operand, v: int) -> vec3:
-        return exert_pairs(v, o.ends, o.entries, o.weights, o.response)
+        return total_share(v, o.ends, o.shares)
 
     return Operator(Operand, feel, exert)
 

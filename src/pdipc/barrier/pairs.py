@@ -218,9 +218,10 @@ def kernels(real: Real) -> SimpleNamespace:
         ends: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
         sorted_out: wp.array(dtype=wp.int32),
+        place_out: wp.array(dtype=wp.int32),
     ):
         """Puts a vertex's pairs in order, so that its sums do not depend on how threads raced to fill the list: each goes after as many
-        as are less."""
+        as are less. place: where each vertex of each pair has gone."""
         worker = span.first + wp.tid()
         for b in range(worker * span.block, count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, count[0])):
@@ -234,6 +235,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         if entries[i] < k * 4 + s:
                             before += 1
                     sorted_out[low + before] = k * 4 + s
+                    place_out[k * 4 + s] = low + before
 
     @wp.kernel(module=module)
     def linearize(
@@ -386,6 +388,24 @@ def kernels(real: Real) -> SimpleNamespace:
     )
 
 
+@functools.cache
+def total_share(real: Real) -> wp.Function:
+    """What vertex v gets of its pairs, each of which has put its share in its place in the list of the vertex."""
+    vec3 = real.vec3
+
+    @wp.func
+    def total(v: int, ends: wp.array(dtype=wp.int32), shares: wp.array(dtype=vec3)) -> vec3:
+        low = int(0)
+        if v > 0:
+            low = ends[v - 1]
+        total_of_vertex = vec3()
+        for i in range(low, ends[v]):
+            total_of_vertex += shares[i]
+        return total_of_vertex
+
+    return total
+
+
 @dataclass
 class Exerted:
     """Forces of pairs. quads: (k, 4) int32, the vertices of each, of which the first is on one side and the last on the other. forces:
@@ -431,7 +451,9 @@ class ActivePairs:
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
-        self.unsorted = wp.zeros(4 * capacity if self.device.wide else 1, dtype=wp.int32, device=self.device.warp)
+        wide = 4 * capacity if self.device.wide else 1
+        self.unsorted, self.places = (wp.zeros(wide, dtype=wp.int32, device=self.device.warp) for _ in range(2))
+        self.shares = wp.zeros(wide, dtype=real.vec3, device=self.device.warp)
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
 
@@ -476,7 +498,7 @@ class ActivePairs:
         filled = self.unsorted if device.wide else self.entries
         device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, filled])
         if device.wide:
-            inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries]
+            inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries, self.places]
             device.launch_list(k.sort_incident, self.capacity, inputs)
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:

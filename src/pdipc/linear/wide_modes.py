@@ -24,6 +24,8 @@ from pdipc.device.precision import Real
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import LOST, MODES, RigidModes
 
+SHARES = 32  # threads that share a row of C in an elimination: each solves with the pivot, which takes longer than its part of the row
+
 
 class WideModes(RigidModes):
     """The groups' vertices are cut into chunks, a block of threads each. chunk_starts: (chunks + 1,) into `members`; chunk_group:
@@ -78,7 +80,7 @@ class WideModes(RigidModes):
         device.launch(k.lead, MODES * groups, [MODES * groups, self.c, self._lead])
         here, there = self.c, self._other
         for pivot in range(groups):
-            device.launch(k.eliminate, MODES * groups**2, [groups, pivot, self._lead, here, there])
+            device.launch(k.eliminate, MODES * groups * SHARES, [groups, SHARES, pivot, self._lead, here, there])
             here, there = there, here
 
     def couple(self, kernel: wp.Kernel, count: wp.array, capacity: int, inputs: list) -> None:
@@ -340,15 +342,15 @@ def kernels(real: Real) -> SimpleNamespace:
     def eliminate(
         first: int,
         groups: int,
+        shares: int,
         pivot: int,
         leading: wp.array(dtype=wide),
         c: wp.array(dtype=wide),
         c_out: wp.array(dtype=wide),
     ):
-        """One step of block Gauss-Jordan: row i of the block of columns of group h."""
+        """One step of block Gauss-Jordan: row i of every so many-th block of columns, from the thread's on."""
         worker = first + wp.tid()
-        i = worker // groups
-        h = worker % groups
+        i = worker // shares
         size = MODES * groups
         inside = i // MODES == pivot
         a = vec6()
@@ -358,15 +360,16 @@ def kernels(real: Real) -> SimpleNamespace:
             else:
                 a[k] = c[i * size + MODES * pivot + k]
         w = solve_pivot(pivot, size, leading, c, a)
-        for j in range(MODES):
-            at = i * size + MODES * h + j
-            if h == pivot:
-                c_out[at] = wp.where(inside, w[j], -w[j])
-            else:
-                total = wide(0.0)
-                for k in range(MODES):
-                    total += w[k] * c[(MODES * pivot + k) * size + MODES * h + j]
-                c_out[at] = wp.where(inside, total, c[at] - total)
+        for h in range(worker % shares, groups, shares):
+            for j in range(MODES):
+                at = i * size + MODES * h + j
+                if h == pivot:
+                    c_out[at] = wp.where(inside, w[j], -w[j])
+                else:
+                    total = wide(0.0)
+                    for k in range(MODES):
+                        total += w[k] * c[(MODES * pivot + k) * size + MODES * h + j]
+                    c_out[at] = wp.where(inside, total, c[at] - total)
 
     @wp.kernel(module=module)
     def restrict(
