@@ -28,7 +28,7 @@ from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_modes import WideModes
 from pdipc.linear.wide_modes import functions as mode_functions
 
-PAIR_BLOCKS = 264  # blocks of threads that share the pairs of contacts: two on each multiprocessor of an H100
+PAIR_BLOCKS = 264  # blocks of threads that share the pairs of contacts, at most: two on each multiprocessor of an H100
 TURN = 4  # iterations in a turn of the loop, which costs as much as some launches; even
 ALPHA, GAMMA = 0, 1  # of the iteration before, in `numbers`
 GOING, LEFT, STARTED, FLAGS = 0, 1, 2, 3  # whether to go on, iterations that are left, whether one was made
@@ -37,7 +37,8 @@ GOING, LEFT, STARTED, FLAGS = 0, 1, 2, 3  # whether to go on, iterations that ar
 class Operator(NamedTuple):
     """The Hessian of a kind of contact as Warp functions, for kernels that do more than its product.
 
-    Operand: the struct of arrays that they work on; a `Coupling` makes one by `operand()`, which has `count`, (1,) int32.
+    Operand: the struct of arrays that they work on; a `Coupling` makes one by `operand()`, which has `count`, (1,) int32, at most the
+    `capacity` of the coupling.
     feel(o, k, p): what pair k feels under the motion p, kept in the operand; returns p . (Hessian) p, J.
     exert(o, v): the force that vertex v then gets, N.
     """
@@ -108,8 +109,10 @@ class WidePcg(BlockPcg):
         others = [c for c in couplings if c.operand() is None]
         kinds, beside = len(operands), int(len(others) > 0)
         operands += [o.Operand() for o in self._operators[kinds:]]
-        slots = self._row_blocks + PAIR_BLOCKS
-        product = [modes.members, self._vertices, self._row_blocks, PAIR_BLOCKS, *rows, self._u, kinds, *operands, beside]
+        room = max((c.capacity for c in couplings if c.operand() is not None), default=0)
+        pair_blocks = min(PAIR_BLOCKS, -(-room // BLOCK))
+        slots = self._row_blocks + pair_blocks
+        product = [modes.members, self._vertices, self._row_blocks, pair_blocks, *rows, self._u, kinds, *operands, beside]
         vectors = [self._w, self._u, self._p, self._s, p, self._r]
         chunks = [modes.chunk_starts, modes.members, modes.arms]
         sums = [self._gamma, modes.chunks, self._delta, slots]
