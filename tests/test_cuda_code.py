@@ -12,7 +12,7 @@ from pdipc.constraints import projector
 from pdipc.device import launch as parallel
 from pdipc.device import sums
 from pdipc.device.precision import real
-from pdipc.integration import inertia
+from pdipc.integration import inertia, script
 from pdipc.integration import loads as forces
 from pdipc.linear import block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
 from pdipc.nonlinear import anderson, local_global, newton
@@ -21,6 +21,7 @@ from pdipc.paper_mode import targets as paper
 
 FACTORIES = {
     "step": inertia.kernels,
+    "script": script.kernels,
     "newton": newton.kernels,
     "body sums": lambda _: sums.kernels(),
     "local-global": local_global.kernels,

@@ -108,3 +108,6 @@ class Rails:
 
     def couple(self, modes) -> None:
         """Nothing: few vertices, which the diagonal knows."""
+
+    def operand(self) -> None:
+        """None: there is `apply`."""
