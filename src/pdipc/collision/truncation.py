@@ -90,18 +90,17 @@ def kernels(real: Real) -> SimpleNamespace:
                         if t <= scalar(1.0):
                             time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
                             hits += 1
-                            if passes[0] == 0:
-                                apart = scalar(0.0)
-                                if wp.static(edge_edge):
-                                    apart = dist.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
-                                else:
-                                    apart = dist.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
-                                if apart - xi < scalar(DEEP) * limits[k][1]:
-                                    # whoever writes, writes the same
-                                    if island_of[q[0]] >= 0:
-                                        deep_out[island_of[q[0]]] = 1
-                                    if island_of[q[3]] >= 0:
-                                        deep_out[island_of[q[3]]] = 1
+                            apart = scalar(0.0)
+                            if wp.static(edge_edge):
+                                apart = dist.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                            else:
+                                apart = dist.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                            if apart - xi < scalar(DEEP) * limits[k][1]:
+                                # whoever writes, writes the same
+                                if island_of[q[0]] >= 0:
+                                    deep_out[island_of[q[0]]] = 1
+                                if island_of[q[3]] >= 0:
+                                    deep_out[island_of[q[3]]] = 1
                     time_out[k] = time
                 hits_out[begin // span.block] = hits
 

@@ -90,11 +90,17 @@ class BlockMatrix:
         self.values = wp.zeros(self.nnz + 1, dtype=real.mat33, device=device.warp)
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.held = wp.array(np.where(free, held, 0.0), dtype=real.scalar, device=device.warp)
+        self._unrestrained = wp.clone(self.held)
         self._starts = wp.array(starts.astype(np.int32), device=device.warp)
         self._slots = upload(slot[order], wp.int32)
         self._scalars = upload(scalars, real.scalar)
         self._blocks = projector.blocks  # made now: recording must not allocate
         self._kernels = kernels(real)
+
+    def restrain(self, body: wp.array, restraint: wp.array) -> None:
+        """Launches `held` as 1 + restraint times what it is by itself, body by body. body: (n,) int32, -1 for none."""
+        inputs = [body, restraint, self._unrestrained, self.held]
+        self.device.launch(self._kernels.restrain, self.count, inputs)
 
     def assemble(self, base: wp.array, u: wp.array, project: wp.array) -> None:
         """Launches the values at x = base + u; project: see `Hessians`."""
@@ -161,4 +167,18 @@ def kernels(real: Real) -> SimpleNamespace:
         total[2, 2] = total[2, 2] + held[i]
         diagonal_out[i] = total
 
-    return SimpleNamespace(gather=gather, gather_diagonal=gather_diagonal)
+    @wp.kernel(module=module)
+    def restrain(
+        first: int,
+        body: wp.array(dtype=wp.int32),
+        restraint: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
+        held_out: wp.array(dtype=scalar),
+    ):
+        i = first + wp.tid()
+        total = held[i]
+        if body[i] >= 0:
+            total += restraint[body[i]] * held[i]
+        held_out[i] = total
+
+    return SimpleNamespace(gather=gather, gather_diagonal=gather_diagonal, restrain=restrain)

@@ -17,7 +17,7 @@ fraction that truncation left to one of its vertices, then by halves. What CCD h
 unless a script moves something that the island may touch: then the potential itself has changed.
 
 Newton's own step is the estimate of the error, since it is what one more iteration would change: the step has converged when no free
-vertex would go further than the tolerance, was neither truncated nor turned back, and all that is scripted has arrived. What is
+vertex would go further than the tolerance, was neither truncated nor turned back, nor held back, and all that is scripted has arrived. What is
 scripted goes from waypoint to waypoint, an outer iteration each where nothing is in the way (`integration.script`).
 """
 
@@ -50,6 +50,9 @@ HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
+RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
+RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below that
+LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
 SLACK = {
     "float32": 4.0e-7,
@@ -472,13 +475,52 @@ def kernels(real: Real) -> SimpleNamespace:
         renew_out[0] = renew
 
     @wp.kernel(module=module)
+    def restrain(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        squeezed: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        restraint: wp.array(dtype=scalar),
+        restrained_out: wp.array(dtype=wp.int32),
+    ):
+        """By how many times its inertia each body is held back, as in the method of Levenberg and Marquardt.
+
+        Newton's step doubles a tiny gap, if it is made whole. But what slides past such a gap hits it at once, and an island that is shortened by
+        that makes no way, and squeezes the gap further. Inertia shortens the sliding and leaves the opening, which is stiff, as it is.
+        """
+        restrained = int(0)
+        for b in range(bodies):
+            island = label[b]
+            r = scalar(RELEASE) * restraint[b]
+            if r < scalar(RELEASED):
+                r = scalar(0.0)
+            if squeezed[island] != 0 and attempts[0] > 1 and least[island] < scalar(RESTRAIN):
+                r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
+                r = wp.min(r, scalar(MOST_RESTRAINT))
+            restraint[b] = r
+            if r > scalar(0.0):
+                restrained = 1
+        restrained_out[0] = restrained
+
+    @wp.kernel(module=module)
     def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
         i = first + wp.tid()
         if free[i] > scalar(0.0):
             p[i] = vec3()
 
     @wp.kernel(module=module)
-    def start(first: int, lagging_out: wp.array(dtype=wp.int32)):
+    def start(
+        first: int,
+        bodies: int,
+        lagging_out: wp.array(dtype=wp.int32),
+        restraint_out: wp.array(dtype=scalar),
+        restrained_out: wp.array(dtype=wp.int32),
+    ):
+        for b in range(bodies):
+            restraint_out[b] = scalar(0.0)
+        restrained_out[0] = 0
         lagging_out[0] = FRICTION_LAGS
 
     @wp.kernel(module=module)
@@ -499,6 +541,7 @@ def kernels(real: Real) -> SimpleNamespace:
         attempts: wp.array(dtype=wp.int32),
         script: wp.array(dtype=wp.int32),
         projected: wp.array(dtype=wp.int32),
+        restrained: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
         tolerance: scalar,
@@ -542,7 +585,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if projected[0] != 0:
                 left = left / scalar(EXACT)
-            settled = left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0
+            settled = (
+                left <= tolerance and hits[0] == 0 and attempts[0] == 1 and count[status.MOVING] == 0 and restrained[0] == 0
+            )
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind and script[AHEAD] == 0:
@@ -654,8 +699,10 @@ class Newton:
             self.lagging,
             self.project,
             self.renew,
-        ) = (zeros(wp.int32, 1) for _ in range(6))
+            self.restrained,
+        ) = (zeros(wp.int32, 1) for _ in range(7))
         self.nobody = zeros(wp.int32, len(work.script.movers))
+        self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
         self.largest = Reducer(device, real, n)
         lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
@@ -695,7 +742,7 @@ class Newton:
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        self.device.launch_serial(self.kernels.start, [self.lagging])
+        self.device.launch_serial(self.kernels.start, [self.bodies, self.lagging, self.restraint, self.restrained])
         self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
@@ -762,6 +809,7 @@ class Newton:
         self.largest.max(self.scales, self.numbers, status.FORCE_SCALE)
 
     def _assemble(self) -> None:
+        self.matrix.restrain(self.islands.body, self.restraint)
         self.matrix.assemble(self.work.x_start, self.work.u, self.project)
         self.solver.prepare(self.work.x, self._couplings())
 
@@ -783,6 +831,7 @@ class Newton:
         """The velocities of restitution, `r.u_now`, by one step: the correction is small beside what bends an element."""
         w, model, n = self.work, self.model, self.model.vertex_count
         self.device.launch_serial(self.kernels.set_flag, [self.project])
+        self.matrix.restrain(self.islands.body, self.unrestrained)
         self.matrix.assemble(w.x_start, w.u, self.project)
         r.linearize_exact(w.rest)
         self.device.launch(
@@ -863,9 +912,12 @@ class Newton:
             device.launch(k.crowd, p.capacity, inputs)
         w.script.advance(w.x_start, w.u, t.fraction)
         s = model.settings
-        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, w.candidates.overflow, w.clock]
+        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, self.restrained]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
-        device.launch_serial(k.decide, [*states, *limits, self.numbers, self.lagging, w.count, w.going])
+        times = [w.candidates.overflow, w.clock]
+        device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])
+        which = [self.islands.label, self.squeezed, self.attempts, self.island_least]
+        device.launch_serial(k.restrain, [self.bodies, *which, self.restraint, self.restrained])
 
 
 @functools.cache
