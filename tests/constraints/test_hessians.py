@@ -126,13 +126,16 @@ def differences(projector, base, u, vertices):
 
 
 def blocks(projector, base, u, corners, project):
-    """(e, 3 c, 3 c): what the projector makes of the blocks of corners a <= b."""
+    """(e, 3 c, 3 c): what the projector makes of the blocks of corners a < b, whose rows add up to zero."""
     projector.differentiate(upload(base), upload(u), wp.array([project], dtype=wp.int32, device="cpu"))
     values = projector.blocks.numpy().reshape(-1, corners * (corners + 1) // 2, 3, 3)
     found = np.zeros((len(values), corners, 3, corners, 3))
     for k, (a, b) in enumerate(itertools.combinations_with_replacement(range(corners), 2)):
-        found[:, b, :, a] = np.swapaxes(values[:, k], 1, 2)
-        found[:, a, :, b] = values[:, k]
+        if a != b:
+            found[:, b, :, a] = np.swapaxes(values[:, k], 1, 2)
+            found[:, a, :, b] = values[:, k]
+            found[:, a, :, a] -= found[:, a, :, b]
+            found[:, b, :, b] -= found[:, b, :, a]
     return found.reshape(len(values), 3 * corners, 3 * corners)
 
 

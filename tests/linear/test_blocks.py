@@ -61,9 +61,10 @@ def elastic(model, matrix):
         for vertices in s.vertices:
             for a in range(corners):
                 for b in range(a, corners):
-                    found[vertices[a], :, vertices[b]] += values[at]
-                    if a != b:
-                        found[vertices[b], :, vertices[a]] += values[at].T
+                    if a != b:  # rows add up to zero
+                        for i, j, block in ((vertices[a], vertices[b], values[at]), (vertices[b], vertices[a], values[at].T)):
+                            found[i, :, j] += block
+                            found[i, :, i] -= block
                     at += 1
     assert at == projector.block_count
     return found.reshape(3 * n, 3 * n)

@@ -51,9 +51,10 @@ def stable(assembly, positions, held):
         for v in s.vertices:
             for a in range(len(v)):
                 for b in range(a, len(v)):
-                    hessian[v[a], :, v[b]] += blocks[at]
-                    if a != b:
-                        hessian[v[b], :, v[a]] += blocks[at].T
+                    if a != b:  # rows add up to zero
+                        for i, j, block in ((v[a], v[b], blocks[at]), (v[b], v[a], blocks[at].T)):
+                            hessian[i, :, j] += block
+                            hessian[i, :, i] -= block
                     at += 1
     free = ~held.ravel()
     return np.linalg.eigvalsh(hessian.reshape(3 * n, -1)[free][:, free])[0] > 0

@@ -90,7 +90,8 @@ class Projector:
     rails: likewise of attachments along some axes, and rail_hessian, what they add to Newton's matrix. threads: the lengths of stitches, (k,), or None; assign to it to sew.
     cavities: what closed sheets hold, or None; a part of the Newton matrix as well.
     energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
-    blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row.
+    blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row;
+    only a < b need be filled, since rows add up to zero.
     """
 
     def __init__(self, device: Device, real: Real, n_vertices: int, sets: list[ConstraintSet]):

@@ -181,7 +181,7 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
         project: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=mat33),
     ):
-        """The ten blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
+        """The blocks of corners a < b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         b = inverse[e]
         s, turn, axes = f_of.singular_values(f_of.deformation(base, u, vertices[e], b))
@@ -205,16 +205,12 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
         g0 = -(g1 + g2 + g3)
         back = wp.transpose(turn)
         at = offset + 10 * e
-        blocks_out[at] = turn * f_of.block(stretch, p, q, g0, g0) * back
         blocks_out[at + 1] = turn * f_of.block(stretch, p, q, g0, g1) * back
         blocks_out[at + 2] = turn * f_of.block(stretch, p, q, g0, g2) * back
         blocks_out[at + 3] = turn * f_of.block(stretch, p, q, g0, g3) * back
-        blocks_out[at + 4] = turn * f_of.block(stretch, p, q, g1, g1) * back
         blocks_out[at + 5] = turn * f_of.block(stretch, p, q, g1, g2) * back
         blocks_out[at + 6] = turn * f_of.block(stretch, p, q, g1, g3) * back
-        blocks_out[at + 7] = turn * f_of.block(stretch, p, q, g2, g2) * back
         blocks_out[at + 8] = turn * f_of.block(stretch, p, q, g2, g3) * back
-        blocks_out[at + 9] = turn * f_of.block(stretch, p, q, g3, g3) * back
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
 

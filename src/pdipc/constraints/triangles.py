@@ -184,12 +184,9 @@ def hessians(real: Real) -> SimpleNamespace:
         g1 = vec2(c * b[0, 0] + s * b[0, 1], c * b[0, 1] - s * b[0, 0])
         g2 = vec2(c * b[1, 0] + s * b[1, 1], c * b[1, 1] - s * b[1, 0])
         g0 = -(g1 + g2)
-        blocks_out[at] = block(k, p, q, out, u1, u2, n, g0, g0)
         blocks_out[at + 1] = block(k, p, q, out, u1, u2, n, g0, g1)
         blocks_out[at + 2] = block(k, p, q, out, u1, u2, n, g0, g2)
-        blocks_out[at + 3] = block(k, p, q, out, u1, u2, n, g1, g1)
         blocks_out[at + 4] = block(k, p, q, out, u1, u2, n, g1, g2)
-        blocks_out[at + 5] = block(k, p, q, out, u1, u2, n, g2, g2)
 
     return SimpleNamespace(axes=axes, write=write)
 
@@ -257,7 +254,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         project: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=mat33),
     ):
-        """The six blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
+        """The blocks of corners a < b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         f = f_of.deformation(base, u, vertices[e], inverse[e])
         angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
