@@ -1,21 +1,23 @@
-"""The scenes of simulation.py by pdipc and by Newton's SolverVBD, in one run: `python benchmarks/peers.py [--scene NAME] [--steps N]`.
+"""The peers' scenes S1 to S4 (peer_scenes.py) by pdipc and by Newton's SolverVBD, in one run:
+`python benchmarks/peers.py [--scenes s2_10 ...] [--steps N] [--seconds S] [--sides ...]`.
 
-Same meshes, materials, step of 1/100 s, number of steps, float32; each solver in a process of its own. Newton's Python may be another
-one (--newton-python), which needs Newton alone. Prints a table and writes benchmarks/results/peers.json with the machine named.
+Same meshes, materials, masses, step of 1/100 s and number of steps; each solver in a process of its own, on the CPU, until --steps steps or
+--seconds of processor time are done. Prints a table and writes benchmarks/results/peers.json with the machine named.
 
 What differs, and has to be known to read the table:
-- Newton stops after --iterations sweeps, pdipc when a step has converged. Newton's own cloth example takes 10 substeps of 4 sweeps a
-  frame of 1/60 s; --substeps and --iterations set it. `height` is the mean height of the bodies' vertices at the end, to see
-  how far the two agree on the motion.
-- Newton's guarantee against penetration is between surfaces of particles; so obstacles enter as particles that are held, or put where
-  the script says before each substep. It cuts each motion between two detections to 0.425 of the query radius (margin + gap):
-  the gap is therefore made as large as what falls fastest needs in a substep (--gap).
-- Warp's CPU launches, and so Newton's steps, run in one thread. pdipc is measured in one thread, too.
+- pdipc ends a step when it has converged (tolerance 0.01 m/s), in float64; SolverVBD after --iterations sweeps of each of --substeps substeps, in
+  float32, whatever is left then. `height` is the mean height of the bodies' vertices at the end, to see how far they agree on the motion.
+- "newton": obstacles are mesh shapes, which particles of RADIUS keep away from by a penalty; self-contact is on. "newton, truncated": with its
+  penetration-free truncation against shapes as well (rigid_soft_enable_dat), and contact of whole surfaces.
+- Intersections are judged by the witness, obstacles where the script has them; SolverVBD keeps RADIUS between surfaces, so any is a failure of its own.
+- Both run in one thread: PDIPC_THREADS=1, as Warp's CPU launches do.
 """
 
 import argparse
 import json
 import os
+import platform
+import resource
 import subprocess
 import sys
 import tempfile
@@ -23,275 +25,268 @@ import time
 from pathlib import Path
 
 import numpy as np
+import peer_scenes
 
-H = 0.01
-CONTACT_STIFFNESS = 1e4  # N/m: Newton's, of a quadratic penalty that turns into a logarithmic barrier at half the margin
-VERTEX_BUFFER, EDGE_BUFFER = 64, 256  # pairs a vertex, an edge; what does not fit is dropped by Newton
+RESULTS = Path(__file__).parent / "results" / "peers.json"
+SIDES = ("pdipc", "newton", "newton, truncated")
+RADIUS = 2e-3  # m, of Newton's particles: the distance that contact forces begin at
+GAP = 0.02  # m: how far around surfaces Newton looks for contacts, twice what the fastest body moves in a step
+STIFFNESS = {"cloth": 1e4, "solid": 1e6}  # N/m of Newton's contacts: bodies at rest sink by less than RADIUS
+VERTEX_BUFFER, EDGE_BUFFER, BODY_BUFFER = 64, 128, 8192  # pairs that Newton has room for; what does not fit it drops
 
 
-# --- the scene as numbers: all that Newton's process needs ---
+# --- one side, one process: positions (steps + 1, n, 3) of bodies, then obstacles, and what it took ---
 
 
-def scene_of(name: str):
-    """A scene of simulation.py in float32, with a minimum separation that float32 resolves at 2 m."""
-    from simulation import SCENES
+class Recorder:
+    """Takes steps until there are enough, or their processor time is spent; the first, which compiles, does not count."""
 
+    def __init__(self, steps: int, seconds: float):
+        self.steps, self.seconds = steps, seconds
+        self.frames: list[np.ndarray] = []
+        self.processor: list[float] = []
+        self.wall: list[float] = []
+
+    def run(self, step, positions) -> None:
+        self.frames.append(positions())
+        while len(self.processor) < self.steps and sum(self.processor[1:]) < 1e3 * self.seconds:
+            cpu, clock = time.process_time(), time.perf_counter()
+            step()
+            self.processor.append(1e3 * (time.process_time() - cpu))
+            self.wall.append(1e3 * (time.perf_counter() - clock))
+            self.frames.append(positions())
+
+
+def run_ours(name: str, recorder: Recorder) -> int:
+    """Returns the number of unconverged steps."""
     import pdipc
 
-    tables = SCENES[name]()
-    tables["contact"]["minimum_separation"] = 5e-5
-    return pdipc.Scene(simulation={"time_step": H, "precision": "float32"}, **tables)
+    simulation = pdipc.Simulation(peer_scenes.scene(name), "cpu")
+    missed = 0
+
+    def step() -> None:
+        nonlocal missed
+        missed += not simulation.step().converged
+
+    recorder.run(step, lambda: simulation.positions)
+    return missed
 
 
-def describe(name: str, steps: int, substeps: int) -> dict[str, np.ndarray]:
-    """Meshes, materials and scripted positions of a scene, as flat arrays."""
-    from pdipc.model import build
-    from pdipc.scene.movers import movers_of
-
-    model = build(scene_of(name), "cpu")
-    assembly, bodies = model.assembly, []
-    times = H / substeps * np.arange(1, steps * substeps + 1)
-    held = assembly.kinematic_vertices
-    moves = any(not mover.still for mover in movers_of(assembly))
-    arrays = {
-        "x": assembly.positions,
-        "v": assembly.velocities,
-        "triangles": assembly.triangles,
-        "scripted": assembly.scripted,
-        "obstacle": assembly.obstacle,
-        "held": held,
-        "targets": np.array([assembly.kinematic_positions(t) for t in times]) if moves else np.zeros((0, len(held), 3)),
-        "activation_distance": np.array(assembly.activation_distance),
-        "friction": np.array(model.scene.contact.friction),
-    }
-    for i, body in enumerate(assembly.bodies):
-        m = body.material
-        bodies.append({"kind": body.kind, "first": body.first, "last": body.last})
-        if body.kind == "solid":
-            E, nu = m.young_modulus, m.poisson_ratio
-            lame = {"k_mu": E / (2 * (1 + nu)), "k_lambda": E * nu / ((1 + nu) * (1 - 2 * nu))}
-            bodies[-1] |= {"density": m.density, **lame}
-        elif body.kind == "cloth":
-            Y, nu = m.membrane_stiffness, m.poisson_ratio
-            lame = {"tri_ke": Y / (2 * (1 + nu)), "tri_ka": Y * nu / (1 - nu * nu)}
-            bodies[-1] |= {"density": m.areal_density, **lame, "bending_stiffness": m.bending_stiffness}
-        arrays[f"elements{i}"] = (body.tets if body.kind == "solid" else body.triangles).reshape(-1)
-    return {**arrays, "bodies": np.array(json.dumps(bodies))}
-
-
-# --- one solver, one process ---
-
-
-def run_ours(name: str, steps: int, device: str) -> tuple[list[float], list[np.ndarray]]:
-    import pdipc
-
-    simulation = pdipc.Simulation(scene_of(name), device)
-    simulation.step()  # compiles
-    simulation.reset()
-    times, frames = [], []
-    for _ in range(steps):
-        start = time.perf_counter()
-        simulation.step()
-        times.append(1e3 * (time.perf_counter() - start))
-        frames.append(simulation.positions)
-    return times, frames
-
-
-def newton_model(scene: dict[str, np.ndarray], device: str):
-    """The scene in Newton's terms. Elements' own indices count from their body's first vertex."""
+def newton_model(scene, assembly):
+    """The scene in Newton's terms, and the bodies of its obstacles that move."""
     import newton
     import warp as wp
 
-    builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -9.81, 0.0))
-    place = {"pos": wp.vec3(), "rot": wp.quat_identity(), "scale": 1.0, "vel": wp.vec3()}
-    for i, body in enumerate(json.loads(str(scene["bodies"]))):
-        first, last, kind = body.pop("first"), body.pop("last"), body.pop("kind")
-        vertices = [wp.vec3(*p) for p in scene["x"][first:last].tolist()]
-        elements = (scene[f"elements{i}"] - first).tolist()
-        if kind == "solid":
-            builder.add_soft_mesh(vertices=vertices, indices=elements, k_damp=0.0, **place, **body)
+    builder = newton.ModelBuilder(gravity=tuple(scene.simulation.gravity))
+    here, kind = wp.quat_identity(), "solid"
+    for body, table in zip(assembly.bodies, (*scene.bodies, *scene.obstacles), strict=True):
+        x = assembly.rest_positions[body.first : body.last]
+        if body.kind == "obstacle":
+            moving = table.motion is not None
+            number = builder.add_body(is_kinematic=True, mass=1.0) if moving else -1
+            config = newton.ModelBuilder.ShapeConfig(ke=STIFFNESS[kind], kd=1e-2, mu=0.0, margin=0.0)
+            mesh = newton.Mesh(x.astype(np.float32), (body.triangles - body.first).ravel(), compute_inertia=False)
+            builder.add_shape_mesh(number, mesh=mesh, cfg=config)
             continue
-        bending = body.pop("bending_stiffness", 0.0)
-        corners = scene["x"][scene[f"elements{i}"].reshape(-1, 3)]
-        edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).mean()
-        # a hinge of length l between areas A turns by the curvature times 2 (A + A) / (3 l): its energy per angle^2 is 3 D l^2 / (8 A)
-        material = body or {"density": 1.0, "tri_ke": 0.0, "tri_ka": 0.0}
-        material |= {"tri_kd": 0.0, "edge_ke": 0.75 * bending * edge / area, "edge_kd": 0.0}
-        builder.add_cloth_mesh(vertices=vertices, indices=elements, **place, **material)
-    held = scene["held"].tolist()
-    for vertex in held:
-        builder.particle_mass[vertex] = 0.0
-        builder.particle_flags[vertex] &= ~int(newton.ParticleFlags.ACTIVE)
-    builder.particle_qd = [wp.vec3(*v) for v in scene["v"].tolist()]
-    builder.color(include_bending=True)
-    model = builder.finalize(device=device)
-    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = CONTACT_STIFFNESS, 0.0, float(scene["friction"])
+        m, kind = body.material, body.kind
+        velocity = wp.vec3(*map(float, assembly.velocities[body.first]))
+        place = {"pos": wp.vec3(0.0), "rot": here, "scale": 1.0, "vel": velocity, "particle_radius": RADIUS}
+        vertices = [wp.vec3(*map(float, p)) for p in x]
+        if kind == "solid":
+            E, nu = m.young_modulus, m.poisson_ratio
+            lame = {"k_mu": E / (2 * (1 + nu)), "k_lambda": E * nu / ((1 + nu) * (1 - 2 * nu)), "k_damp": 0.0}
+            indices = (body.tets - body.first).ravel().tolist()
+            builder.add_soft_mesh(vertices=vertices, indices=indices, density=m.density, **place, **lame)
+        else:
+            Y, nu = m.membrane_stiffness, m.poisson_ratio
+            corners = x[body.triangles - body.first]
+            area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).mean()
+            edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+            stiff = {"tri_ke": Y / (2 * (1 + nu)), "tri_ka": Y * nu / (1 - nu * nu), "tri_kd": 0.0}
+            # a hinge's energy: ke l theta^2 / 2 there, D l^2 theta^2 / (2 A) with A of both triangles here
+            stiff |= {"edge_ke": m.bending_stiffness * edge / (2 * area), "edge_kd": 0.0}
+            indices = (body.triangles - body.first).ravel().tolist()
+            builder.add_cloth_mesh(vertices=vertices, indices=indices, density=m.areal_density, **place, **stiff)
+    builder.color(include_bending=kind == "cloth")
+    model = builder.finalize(device="cpu")
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = STIFFNESS[kind], 1e-2, 0.0
     return model
 
 
-def run_newton(scene: dict[str, np.ndarray], steps: int, device: str, iterations: int, substeps: int, gap: float | None):
+def run_newton(name: str, side: str, recorder: Recorder, iterations: int, substeps: int) -> None:
     import newton
     import warp as wp
 
-    model = newton_model(scene, device)
-    held = wp.array(scene["held"], dtype=wp.int32, device=device)
-    margin = float(scene["activation_distance"])
-    query = margin + gap if gap is not None else max(2 * margin, fastest(scene, steps) * H / substeps / 0.425)
+    from pdipc.scene.assembly import assemble
+
+    wp.set_device("cpu")
+    scene = peer_scenes.scene(name)
+    assembly = assemble(scene)
+    model = newton_model(scene, assembly)
+    truncated = side.endswith("truncated")
+    whole = {"enable_rigid_soft_full_surface_contact": True} if truncated else {}
+    pipeline = newton.CollisionPipeline(model, soft_contact_gap=GAP, **whole)
     options = {
         "iterations": iterations,
         "particle_enable_self_contact": True,
-        "particle_self_contact_margin": margin,
-        "particle_self_contact_gap": query - margin,
+        "particle_self_contact_margin": RADIUS,
+        "particle_self_contact_gap": 4 * RADIUS,
+        "particle_enable_tile_solve": False,
         "particle_vertex_contact_buffer_size": VERTEX_BUFFER,
         "particle_edge_contact_buffer_size": EDGE_BUFFER,
     }
+    if truncated:
+        options |= {
+            "rigid_soft_enable_dat": True,
+            "collision_pipeline": pipeline,
+            "rigid_body_particle_contact_buffer_size": BODY_BUFFER,
+        }
+    solver = newton.solvers.SolverVBD(model, **options)
+    states, control = [model.state(), model.state()], model.control()
+    contacts = None if truncated else pipeline.contacts()
+    moving = [body for body in assembly.bodies if body.kind == "obstacle" and not body.trajectory.is_static]
+    count, h, taken = model.particle_count, peer_scenes.H, 0
 
-    @wp.kernel
-    def put(
-        vertices: wp.array(dtype=wp.int32), to: wp.array(dtype=wp.vec3), a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3)
-    ):
-        i = wp.tid()
-        a[vertices[i]] = to[i]
-        b[vertices[i]] = to[i]
+    def substep() -> None:
+        states[0].clear_forces()
+        if not truncated:
+            pipeline.collide(states[0], contacts)
+        solver.step(states[0], states[1], control, contacts, h / substeps)
+        states.reverse()
 
-    def run(count: int) -> tuple[list[float], list[np.ndarray]]:
-        solver = newton.solvers.SolverVBD(model, **options)
-        now, after, control = model.state(), model.state(), model.control()
-        targets = [wp.array(each, dtype=wp.vec3, device=device) for each in scene["targets"][: count * substeps]]
-        times, frames = [], []
-        for step in range(count):
-            start = time.perf_counter()
-            solver.rebuild_bvh(now)
-            for substep in range(step * substeps, (step + 1) * substeps):
-                now.clear_forces()
-                if targets:
-                    wp.launch(put, len(held), inputs=[held, targets[substep], now.particle_q, after.particle_q], device=device)
-                solver.step(now, after, control, None, H / substeps)
-                now, after = after, now
-            wp.synchronize_device(device)
-            times.append(1e3 * (time.perf_counter() - start))
-            frames.append(now.particle_q.numpy().copy())  # on the CPU a view
-        return times, frames
+    def once() -> None:
+        for _ in range(substeps):
+            substep()
 
-    run(1)  # compiles
-    return run(steps)
+    graph = None
+    if not moving and substeps % 2 == 0:  # as Newton's examples do: recorded, then replayed
+        with wp.ScopedCapture(device="cpu") as capture:
+            once()
+        graph = capture.graph
 
+    def step() -> None:
+        nonlocal taken
+        if graph is not None:
+            wp.capture_launch(graph)
+            taken += 1
+            return
+        for k in range(substeps):
+            time_at = (taken + (k + 1) / substeps) * h
+            for state in states if moving else ():
+                q = state.body_q.numpy()
+                for number, body in enumerate(moving):
+                    q[number, :3] = body.trajectory.pose(time_at)[1]
+                state.body_q.assign(q)
+            substep()
+        taken += 1
 
-def fastest(scene: dict[str, np.ndarray], steps: int) -> float:
-    """m/s: of a body that falls through all of the height that it has below it, or as long as the run lasts."""
-    free = ~scene["scripted"]
-    start = np.abs(scene["v"]).max()
-    drop = max(0.0, scene["x"][free, 1].min() - scene["x"][~free, 1].min())
-    return min(np.sqrt(start**2 + 2 * 9.81 * drop), start + 9.81 * H * steps)
+    def positions() -> np.ndarray:
+        x = assembly.positions.copy()
+        x[:count] = states[0].particle_q.numpy()
+        for body in moving:
+            own = slice(body.first, body.last)
+            x[own] = body.trajectory.apply(assembly.positions[own], taken * h)
+        return x
+
+    recorder.run(step, positions)
 
 
 # --- the comparison ---
 
 
-def measure(label: str, name: str, options: argparse.Namespace, folder: Path, scene: dict[str, np.ndarray]) -> dict:
-    """Runs one solver in its own process, and counts what intersects."""
-    from simulation import spread
+def inverted(x: np.ndarray, tets: np.ndarray) -> int:
+    """Tets of negative volume."""
+    a, b, c, d = np.moveaxis(x[tets], 1, 0)
+    return int((np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) <= 0).sum())
 
+
+def measure(name: str, side: str, options: argparse.Namespace, folder: Path) -> dict:
+    """A row: one solver on one scene, in a process of its own."""
     import pdipc
+    from pdipc.scene.assembly import assemble
 
-    threads = {"1 thread": "1"}.get(label.partition(", ")[2])
-    python = options.newton_python if label.startswith("newton") else sys.executable
-    own = ["--iterations", str(options.iterations), "--substeps", str(options.substeps)]
-    own += [] if options.gap is None else ["--gap", str(options.gap)]
-    side = ["--side", label.partition(",")[0], "--folder", str(folder), "--device", options.device]
-    command = [python, __file__, "--scene", name, "--steps", str(options.steps), *side, *own]
-    environment = {**os.environ, **({"PDIPC_THREADS": threads} if threads else {})}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    out = folder / "out.npz"
+    command = [sys.executable, __file__, "--side", side, "--scenes", name, "--out", str(out)]
+    for key in ("steps", "seconds", "iterations", "substeps"):
+        command += [f"--{key}", str(getattr(options, key))]
+    done = subprocess.run(command, env={**os.environ, "PDIPC_THREADS": "1"}, capture_output=True, text=True)
     if done.returncode:
-        raise SystemExit(f"{label} failed on {name}:\n{done.stderr[-3000:]}")
-    with np.load(folder / "out.npz") as out:
-        times, frames = out["times"].tolist(), out["frames"].astype(np.float64)
-    finite = [bool(np.isfinite(frame).all()) for frame in frames]
+        raise SystemExit(f"{side} failed on {name}:\n{done.stderr[-3000:]}")
+    assembly = assemble(peer_scenes.scene(name))
+    with np.load(out) as file:
+        frames, processor, wall = file["frames"], file["processor"][1:], file["wall"][1:]
+        missed, memory = int(file["missed"]), float(file["memory"])
+    finite = np.isfinite(frames).all(axis=(1, 2))
     pairs = [
-        len(pdipc.find_intersections(frame, scene["triangles"], scene["obstacle"])) if good else -1
-        for frame, good in zip(frames, finite, strict=True)
+        len(pdipc.find_intersections(x, assembly.triangles, assembly.obstacle)) if good else -1
+        for x, good in zip(frames, finite, strict=True)
     ]
     return {
         "scene": name,
-        "solver": label,
-        "steps": len(times),
-        **spread(times),
-        "intersections_final": pairs[-1],
-        "intersections_worst": max(pairs),
-        "frames_with_intersections": sum(count != 0 for count in pairs),
-        "finite": all(finite),
-        "height": float(frames[-1][~scene["scripted"], 1].mean()),
+        "solver": side,
+        "steps": len(frames) - 1,
+        "median_processor_ms": float(np.median(processor)),
+        "worst_processor_ms": float(processor.max()),
+        "total_processor_s": float(processor.sum() / 1e3),
+        "median_wall_ms": float(np.median(wall)),
+        "unconverged": missed if side == "pdipc" else None,
+        "intersecting_frames": sum(count != 0 for count in pairs),
+        "most_pairs": max(pairs),
+        "inverted_tets": max(inverted(x, assembly.tets) for x in frames[finite]) if len(assembly.tets) else 0,
+        "finite": bool(finite.all()),
+        "height_m": float(frames[-1][~assembly.obstacle, 2].mean()),
+        "peak_memory_mb": memory,
     }
-
-
-def has_newton(python: str) -> bool:
-    return subprocess.run([python, "-c", "import newton"], capture_output=True).returncode == 0
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--scene", action="append", help="A scene of simulation.py; may be repeated. Default: all but the largest."
-    )
-    parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--newton-python", default=sys.executable, metavar="PATH", help="Interpreter that has Newton.")
+    parser.add_argument("--scenes", nargs="+", choices=peer_scenes.SCENES, default=["s2_10", "s4_10", "s3_8", "s1_50"])
+    parser.add_argument("--sides", nargs="+", choices=SIDES, default=list(SIDES))
+    parser.add_argument("--steps", type=int, default=peer_scenes.STEPS)
+    parser.add_argument("--seconds", type=float, default=600.0, help="Processor time of a solver on a scene.")
     parser.add_argument("--iterations", type=int, default=10, help="Newton's sweeps a substep.")
-    parser.add_argument("--substeps", type=int, default=4, help="Newton's substeps in 1/100 s.")
-    parser.add_argument("--gap", type=float, help="m: Newton's detection beyond the margin; default: what the fall needs.")
-    parser.add_argument("--side", choices=("pdipc", "newton"), help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--substeps", type=int, default=4, help="Newton's substeps of a step.")
+    parser.add_argument("--side", choices=SIDES, help=argparse.SUPPRESS)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.side:
+        recorder, missed = Recorder(options.steps, options.seconds), 0
         if options.side == "pdipc":
-            times, frames = run_ours(options.scene[0], options.steps, options.device)
+            missed = run_ours(options.scenes[0], recorder)
         else:
-            with np.load(options.folder / "scene.npz") as file:
-                scene = {key: file[key] for key in file.files}
-            peer = (options.iterations, options.substeps, options.gap)
-            times, frames = run_newton(scene, options.steps, options.device, *peer)
-        np.savez(options.folder / "out.npz", times=times, frames=np.array(frames, dtype=np.float32))
+            run_newton(options.scenes[0], options.side, recorder, options.iterations, options.substeps)
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        times = {"processor": recorder.processor, "wall": recorder.wall}
+        np.savez(options.out, frames=np.array(recorder.frames), missed=missed, memory=memory, **times)
         return
-
-    from simulation import SCENES, machine
-
-    if unknown := [name for name in options.scene or [] if name not in SCENES]:
-        parser.error(f"--scene {unknown[0]}: there are: {', '.join(SCENES)}")
-    labels = ["pdipc", "pdipc, 1 thread"] if options.device == "cpu" else ["pdipc"]
-    if has_newton(options.newton_python):
-        labels.append("newton")
-    else:
-        print(f'{options.newton_python} has no Newton: pdipc alone is measured ("pip install newton", or --newton-python PATH)')
-    settings = {"iterations": options.iterations, "substeps": options.substeps, "gap": options.gap}
-    settings |= {"contact_stiffness": CONTACT_STIFFNESS, "buffers": [VERTEX_BUFFER, EDGE_BUFFER]}
-    rows = []
     report = {
-        "machine": machine(),
-        "device": options.device,
-        "load_average": os.getloadavg()[0],
-        "newton": settings,
-        "rows": rows,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+        "date": time.strftime("%Y-%m-%d"),
+        "newton": {"iterations": options.iterations, "substeps": options.substeps, "radius": RADIUS, "stiffness": STIFFNESS},
+        "rows": [],
     }
-    out = Path(__file__).parent / "results" / "peers.json"
-    out.parent.mkdir(exist_ok=True)
     print(
-        f"{'scene':24} {'solver':16} {'median ms':>10} {'quartiles':>18} {'mean ms':>10} {'final':>6} {'worst':>6} {'height':>8}"
+        f"{'scene':6} {'solver':18} {'steps':>5} {'median ms':>10} {'worst ms':>9} {'unconv':>6} {'inters':>6} {'inverted':>8} {'height':>8}"
     )
-    for name in options.scene or [name for name in SCENES if name != "cloth 200x200"]:
-        scene = describe(name, options.steps, options.substeps)
-        for label in labels:
+    options.output.parent.mkdir(exist_ok=True)
+    for name in options.scenes:
+        for side in options.sides:
             with tempfile.TemporaryDirectory() as folder:
-                np.savez(Path(folder) / "scene.npz", **scene)
-                row = measure(label, name, options, Path(folder), scene)
-            rows.append(row)
-            low, high = row["quartiles_ms"]
+                row = measure(name, side, options, Path(folder))
+            row["load"] = os.getloadavg()[0]
+            report["rows"].append(row)
+            missed = "" if row["unconverged"] is None else row["unconverged"]
             print(
-                f"{name:24} {label:16} {row['median_ms']:10.1f} {f'{low:.1f} to {high:.1f}':>18} {row['mean_ms']:10.1f} "
-                f"{row['intersections_final']:6} {row['intersections_worst']:6} {row['height']:8.4f}",
+                f"{name:6} {side:18} {row['steps']:5} {row['median_processor_ms']:10.1f} {row['worst_processor_ms']:9.1f} {missed:>6} "
+                f"{row['intersecting_frames']:6} {row['inverted_tets']:8} {row['height_m']:8.4f}",
                 flush=True,
             )
-            out.write_text(json.dumps(report, indent=1))  # what was measured stays, whatever happens to the rest
+            options.output.write_text(
+                json.dumps(report, indent=1) + "\n"
+            )  # what was measured stays, whatever happens to the rest
 
 
 if __name__ == "__main__":

@@ -41,8 +41,12 @@ _PUBLIC = {
     "time_of_impact": "pdipc.collision.queries",
 }
 
+_MODULES = ("newton",)  # parts that need an extra
+
 
 def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return importlib.import_module(f"pdipc.{name}")
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, attribute = _PUBLIC[name].partition(":")
@@ -50,4 +54,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted([*_PUBLIC, "__version__"])
+    return sorted([*_PUBLIC, *_MODULES, "__version__"])

@@ -122,24 +122,31 @@ class Controls:
         This is a new start, not a motion: what lies in between does not matter. Raises ValueError, and changes nothing, where the body
         would then intersect anything, be in something closed, or be nearer to anything than the minimum separation.
         """
-        which = self._body(body)
-        own = slice(which.first, which.last)
-        wanted = _numbers(positions, (which.last - which.first, 3), f'positions of body "{body}"')
+        self.set_positions_of({body: positions})
+
+    @one_at_a_time
+    def set_positions_of(self, positions: dict[str, Any]) -> None:
+        """As `set_positions` for several bodies, by name, at once: what one of them leaves is free for another."""
+        assembly, precision = self.model.assembly, self.model.real.name
         x = self.state.positions.numpy().copy()
-        before = x[own].copy()
-        x[own] = wanted
-        moved = np.abs(x[own] - before).max(axis=1) > 0.0
-        if len(stuck := np.flatnonzero(moved & self.model.assembly.scripted[own])):
-            raise ValueError(
-                f'vertex {stuck[0]} of body "{body}" is held exactly at {before[stuck[0]].tolist()} m; it must stay, or be led with set_pin'
-            )
-        precision = self.model.real.name
-        if found := check_placed(self.model.assembly, x.astype(np.float64), precision, self.model.assembly.bodies.index(which)):
-            raise ValueError("\n  ".join([f'body "{body}" cannot be put there:', *map(str, found)]))
+        before, put = x.copy(), np.zeros(len(x), dtype=bool)
+        for body, wanted in positions.items():
+            which = self._body(body)
+            own = slice(which.first, which.last)
+            x[own], put[own] = _numbers(wanted, (which.last - which.first, 3), f'positions of body "{body}"'), True
+            moved = np.abs(x[own] - before[own]).max(axis=1) > 0.0
+            if len(stuck := np.flatnonzero(moved & assembly.scripted[own])):
+                raise ValueError(
+                    f'vertex {stuck[0]} of body "{body}" is held exactly at {before[own][stuck[0]].tolist()} m; it must stay, or be led with '
+                    "set_pin"
+                )
+        for body in positions:
+            if found := check_placed(assembly, x.astype(np.float64), precision, assembly.bodies.index(self._body(body))):
+                raise ValueError("\n  ".join([f'body "{body}" cannot be put there:', *map(str, found)]))
         self.state.positions.assign(x)
         for array in (self.state.remainders, self.state.accelerations):
             values = array.numpy().copy()
-            values[own] = 0.0
+            values[put] = 0.0
             array.assign(values)
 
     @one_at_a_time

@@ -230,6 +230,19 @@ def test_a_new_start_is_taken_or_refused():
         solver.step(now, after, None, None, H)
 
 
+def test_bodies_may_trade_places_in_a_new_start():
+    b = builder()
+    cloth(b, z=0.5)
+    cloth(b, z=0.9)
+    solver = solver_of(b)
+    now, after = solver.model.state(), solver.model.state()
+    solver.step(now, after, None, None, H)
+    q = now.particle_q.numpy().copy()
+    now.particle_q.assign(np.concatenate([q[16:], q[:16]]))
+    solver.step(now, after, None, None, H)
+    assert after.particle_q.numpy()[:, 2].reshape(2, 16).mean(axis=1) == pytest.approx([0.9, 0.5], abs=0.01)
+
+
 def test_another_time_step_goes_on_where_the_last_ended():
     b = builder()
     block(b, z=1.0)

@@ -200,17 +200,19 @@ class SolverPDIPC(SolverBase):
         if not (moved.any() or hurried.any()):
             return
         x, v = simulation.positions, simulation.state.velocities.numpy().astype(np.float64)
-        first = 0
+        first, places, speeds = 0, {}, {}
         for part in self._made.parts:
             own = slice(first, first + len(part.particles))
             first = own.stop
-            for changed, values, now, put in (
-                (moved, q, x, simulation.set_positions),
-                (hurried, qd, v, simulation.set_velocities),
-            ):
-                which = changed[part.particles] & free[own]
-                if which.any():
-                    put(part.name, np.where(which[:, None], values[part.particles], now[own]))
+            here, fast = ((changed[part.particles] & free[own])[:, None] for changed in (moved, hurried))
+            if here.any():
+                places[part.name] = np.where(here, q[part.particles], x[own])
+            if fast.any():
+                speeds[part.name] = np.where(fast, qd[part.particles], v[own])
+        if places:
+            simulation.set_positions_of(places)  # or raises, and nothing has changed
+        for name, values in speeds.items():
+            simulation.set_velocities(name, values)
 
     def _lead(self, simulation: "Simulation", q: np.ndarray, state: newton.State) -> None:
         """Held particles and bodies that are elsewhere than they were sent last are sent there."""

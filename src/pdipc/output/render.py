@@ -313,6 +313,7 @@ class Drawing:
             with self._only(bodies, numbers):
                 image, depth = self._shot(lamp=None)
             number = image.astype(np.int64) @ [1, 256, 65536]
+            number[number > len(bodies)] = 0  # a pixel whose colour is of no body
             of_each = np.bincount(number[depth < 1.0], minlength=len(bodies) + 1)
             for obstacle in obstacles:
                 with self._only([obstacle], None):
