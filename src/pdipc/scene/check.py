@@ -371,7 +371,7 @@ def _turns(scene: Scene, assembly: Assembly) -> Iterator[Finding]:
     h = scene.simulation.time_step / scene.simulation.substeps
     for mover in movers_of(assembly):
         chords = most_chords(mover, h)
-        if not chords <= MOST:
+        if not chords <= MOST and np.isfinite(chords):  # what overflows is out of all bounds, which is said of motions
             assert isinstance(mover.trajectory, Trajectory)
             angle = h * mover.trajectory.fastest()
             found = (
