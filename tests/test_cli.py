@@ -351,7 +351,7 @@ def test_the_shell_completes_names(monkeypatch):
 def test_the_first_run_tells_that_kernels_are_compiled(capsys):
     import warp as wp
 
-    from pdipc.cli.running import _told_of_compiling
+    from pdipc.output.progress import _told_of_compiling
 
     told, level = [], wp.config.log_level
     with _told_of_compiling(told.append):

@@ -143,14 +143,31 @@ def _merged(name: str, values: list[Any]) -> Any:
     return last
 
 
-def simulate(
-    scene: Scene | Model, steps: int | None = None, device: str | None = None, forces: bool = False
-) -> Iterator[Frame]:
-    """Yields a `Frame` after each step: `for frame in pdipc.simulate(scene, steps=100): ...`. forces: see `Simulation.step`."""
-    simulation = Simulation(scene, device)
-    for _ in range(simulation.model.scene.simulation.steps if steps is None else steps):
-        result = simulation.step(forces)
-        yield Frame(simulation.steps_done, simulation.state.time, simulation.positions, result)
+def simulate(scene: Scene | Model, steps: int | None = None, device: str | None = None, forces: bool = False) -> "Frames":
+    """Gives a `Frame` after each step: `for frame in pdipc.simulate(scene, steps=100): ...`. forces: see `Simulation.step`."""
+    return Frames(scene, steps, device, forces)
+
+
+class Frames(Iterator[Frame]):
+    """The frames of a simulation, one after the other; their number is known, as bars of progress ask for."""
+
+    def __init__(self, scene: Scene | Model, steps: int | None, device: str | None, forces: bool):
+        described = scene.scene if isinstance(scene, Model) else scene
+        self._left = described.simulation.steps if steps is None else steps
+        self._make: Callable[[], Simulation] = lambda: Simulation(scene, device)
+        self._simulation: Simulation | None = None
+        self._forces = forces
+
+    def __len__(self) -> int:
+        return self._left
+
+    def __next__(self) -> Frame:
+        if self._left <= 0:
+            raise StopIteration
+        self._simulation = simulation = self._simulation or self._make()
+        result = simulation.step(self._forces)
+        self._left -= 1
+        return Frame(simulation.steps_done, simulation.state.time, simulation.positions, result)
 
 
 def stats_of(result: StepResult) -> dict[str, Any]:
@@ -171,19 +188,25 @@ def run_scene(
     overwrite: bool = False,
     certify: bool = False,
     forces: bool = False,
-    progress: Callable[[StepInfo], None] | None = None,
+    progress: Callable[[StepInfo], None] | bool | None = None,
 ) -> None:
     """Simulates `scene` into the folder `out_dir`: frames, statistics, checkpoints. The folder is locked meanwhile.
 
     A run that was stopped, at any moment and by whatever, goes on with `resume=True` from its last checkpoint, and gives the same bits
     as one that was not. certify: also record every committed motion, for `pdipc certify`. forces: of contact on every vertex, too; those on
-    bodies and between them are always recorded. progress: called after each step.
+    bodies and between them are always recorded. progress: called after each step; True for a bar
+    in the terminal or notebook.
 
     Raises SceneError for a scene that cannot be simulated, before anything is launched; RunError where the folder does not take this
     run, is being written by another process, or has no room.
     """
+    from pdipc.output.progress import bar_of_steps
     from pdipc.output.results import RunError, RunWriter, open_run
 
+    if progress is True:
+        with bar_of_steps(scene.simulation.steps if steps is None else steps) as advance:
+            options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
+            return run_scene(scene, out_dir, steps=steps, device=device, progress=advance, **options)
     if resume:
         begun = open_run(out_dir)
         if where := _first_difference(*(_without_steps(each) for each in (Scene.model_validate(begun.scene), scene))):
@@ -210,7 +233,7 @@ def run_scene(
             meta["moved_at_the_start"] = model.assembly.separated
         writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
     with writer:
-        _run(simulation, writer, steps, certify, forces, progress)
+        _run(simulation, writer, steps, certify, forces, progress or None)
 
 
 def _without_steps(scene: Scene) -> dict[str, Any]:

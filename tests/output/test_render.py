@@ -127,6 +127,9 @@ def test_obstacles_that_hide_bodies_let_them_be_seen(tmp_path):
     run = box(tmp_path / "run")
     assert not share(drawn(run, obstacles="solid"), BLUE).any()
     shown = {how: share(drawn(run, obstacles=how, shadows=False), BLUE).mean() for how in ("auto", "translucent", "hidden")}
+    assert share(drawn(run, edges=True, shadows=False), BLUE).mean() > 0.2 * shown["auto"]  # lines do not disturb the judgement
+    run.scene["obstacles"] = [{"name": "x1", "look": {"opacity": 0.2}}]
+    assert share(drawn(run, shadows=False), BLUE).mean() > 0.6 * shown["auto"]
     assert min(shown.values()) > 0.005
     assert shown["hidden"] > 2 * shown["auto"]  # without the box, the camera is nearer
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from pdipc.output.summary import metres as metres
+
 if TYPE_CHECKING:
     from pdipc.scene.schema import Scene
 
@@ -154,16 +156,6 @@ def outside_of_runs(path: Path | None, option: str = "--output") -> None:
 
 
 # --- telling ---
-
-
-def metres(length: float | None) -> str:
-    """A length for people: "1.20 mm"; "none" where it is None or infinite."""
-    if length is None or length == float("inf"):
-        return "none"
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("um", 1e-6)):
-        if abs(length) >= size:
-            return f"{length / size:.3g} {unit}"
-    return f"{length / 1e-9:.3g} nm"
 
 
 @contextmanager

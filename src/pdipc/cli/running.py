@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +13,6 @@ import typer
 from pdipc.cli.app import SceneArgument, command, load, metres
 
 if TYPE_CHECKING:
-    from pdipc.output.results import Run
     from pdipc.scene.assembly import Assembly
     from pdipc.scene.schema import Scene
     from pdipc.simulation import StepInfo
@@ -51,6 +50,9 @@ def run(
     ] = False,
 ) -> None:
     """Simulate a scene into a folder. Ctrl-C ends it after a step; --resume goes on as if it had never been stopped."""
+    from rich.console import Console
+
+    from pdipc.output.progress import bar_of_steps
     from pdipc.output.results import open_run
 
     if resume and overwrite:
@@ -66,7 +68,7 @@ def run(
     began = time.monotonic()
     stop = Stop()
     try:
-        with stop.after_steps(), _bar(total) as bar:
+        with stop.after_steps(), bar_of_steps(total, Console(stderr=True)) as bar:
             from pdipc.simulation import run_scene
 
             def advance(info: "StepInfo") -> None:
@@ -153,75 +155,16 @@ class Stop:
             raise KeyboardInterrupt
 
 
-@contextmanager
-def _bar(total: int) -> Iterator[Callable[["StepInfo"], None]]:
-    """A bar of steps on stderr; yields a function to call after each."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = [TextColumn("step"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[told]}")]
-    last = time.monotonic()
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
-        task = bar.add_task("step", total=total, told="preparing")
-
-        def advance(info: "StepInfo") -> None:
-            nonlocal last
-            now, result = time.monotonic(), info.result
-            told = f"outer {result.outer:<3d} contacts {result.barriers:<6d} gap {metres(result.smallest_gap)}"
-            bar.update(task, completed=info.step, total=info.steps, told=f"{told}  {1000 * (now - last):.0f} ms/step")
-            last = now
-
-        def compiled(modules: int) -> None:
-            if modules == 1:
-                bar.console.print("compiling kernels, once; they are kept for later runs")
-            bar.update(task, told=f"{modules} modules of kernels compiled")
-
-        with _told_of_compiling(compiled):
-            yield advance
-
-
-@contextmanager
-def _told_of_compiling(tell: Callable[[int], None]) -> Iterator[None]:
-    """Calls `tell` with the number of kernel modules that Warp has compiled, after each."""
-    import warp as wp
-
-    from pdipc.device import precision  # noqa: F401  (makes Warp quiet: what is set here comes after)
-
-    usual, modules = wp.get_logger(), 0
-
-    class Listening:
-        debug, warning, error = staticmethod(usual.debug), staticmethod(usual.warning), staticmethod(usual.error)
-
-        @staticmethod
-        def info(message: str) -> None:
-            nonlocal modules
-            if message.endswith("(compiled)"):
-                modules += 1
-                tell(modules)
-
-    level = wp.config.log_level
-    wp.set_logger(Listening())
-    wp.config.log_level = wp.LOG_INFO
-    try:
-        yield
-    finally:
-        wp.set_logger(usual)
-        wp.config.log_level = level
-
-
 def _summary(folder: Path, seconds: float) -> None:
     from pdipc.output.results import open_run
+    from pdipc.output.summary import smallest_gap
 
     done = open_run(folder)
     typer.echo(f"{folder}: {done.frame_count - 1} steps, {done.times[-1]:g} s simulated, {seconds:.1f} s of work")
-    typer.echo(f"smallest gap {metres(_smallest_gap(done))}")
+    typer.echo(f"smallest gap {metres(smallest_gap(done))}")
     stopped = sum(not record.get("converged", True) for record in done.stats)
     if stopped:
         typer.echo(f"{stopped} steps ended at the limit of outer iterations before convergence; they are free of intersections")
-
-
-def _smallest_gap(done: "Run") -> float | None:
-    return min((record["smallest_gap"] for record in done.stats if record.get("smallest_gap") is not None), default=None)
 
 
 @command()
@@ -232,6 +175,7 @@ def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run fo
     from rich.table import Table
 
     from pdipc.output.results import open_run
+    from pdipc.output.summary import told_of
     from pdipc.scene.assembly import assemble
 
     console = Console(soft_wrap=True, highlight=False)
@@ -257,7 +201,7 @@ def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run fo
         f"minimum separation {metres(assembly.minimum_separation)}"
     )
     if opened is not None:
-        for line in _told_of(opened, sim.steps):
+        for line in told_of(opened, sim.steps):
             console.print(line, markup=False)
 
 
@@ -270,37 +214,3 @@ def _pins(assembly: "Assembly") -> Iterator[str]:
         since = f", from {pin.start:g} s on" if pin.start > 0.0 else ""
         until = f", until {pin.end:g} s" if pin.end < float("inf") else ""
         yield f"pin of {pin.body}: {len(pin.vertices)} vertices, held {how}{with_what}{since}{until}"
-
-
-def _told_of(opened: "Run", steps: int) -> Iterator[str]:
-    """Lines about a run: time, convergence, contact, machine, versions."""
-    stats, meta = opened.stats, opened.meta
-    yield f"{opened.frame_count} frames, {opened.times[-1] if opened.frame_count else 0:g} s; {len(stats)} of {steps} steps done"
-    spent = sorted(sum(record["milliseconds"].values()) for record in stats if record.get("milliseconds"))
-    if spent:
-        yield f"{sum(spent) / 1e3:.3g} s of work, median {spent[len(spent) // 2]:.3g} ms a step, longest {spent[-1]:.3g} ms"
-    judged = [record["converged"] for record in stats if "converged" in record]
-    if judged:
-        worst = max((record["residual"] for record in stats if record.get("residual") is not None), default=None)
-        share = 100.0 * sum(judged) / len(judged)
-        yield f"{share:.4g} % of the steps converged ({len(judged) - sum(judged)} did not), worst residual {_residual(worst)}"
-    contacts = [record["barriers"] for record in stats if "barriers" in record]
-    if contacts:
-        yield f"smallest gap {metres(_smallest_gap(opened))}, at most {max(contacts)} contacts"
-    on = [f"{meta[name]}" for name in ("device", "precision", "machine") if name in meta]
-    if "threads" in meta:
-        on.insert(1, f"{meta['threads']} threads")
-    yield "made on " + ", ".join(on)
-    versions = ("pdipc", "warp-lang", "numpy", "python")
-    yield "with " + ", ".join(f"{name} {meta[name]}" for name in versions if name in meta)
-    rest = {
-        name: value
-        for name, value in meta.items()
-        if name not in {*versions, "format", "device", "precision", "machine", "threads"}
-    }
-    if rest:
-        yield ", ".join(f"{name} {value}" for name, value in rest.items())
-
-
-def _residual(length: float | None) -> str:
-    return "unknown" if length is None else metres(length)

@@ -329,13 +329,13 @@ class Drawing:
     def _only(self, shown: "list[_Body]", numbers: np.ndarray | None) -> Iterator[None]:
         """Draws nothing but some bodies, in flat colours that are numbers, if given."""
         for body in (*self.bodies, *self.grounds):
-            body.actor.visibility = body in shown
+            body.show(body in shown, alone=True)
         if numbers is not None:
             for body, number in zip(shown, numbers, strict=True):
                 body.flat([number % 256, number // 256 % 256, number // 65536])
         yield
         for body in (*self.bodies, *self.grounds):
-            body.actor.visibility = True
+            body.show(True)
         if numbers is not None:
             for body in shown:
                 body.flat(None)
@@ -363,10 +363,8 @@ class Drawing:
         for light in everywhere:
             light.on = not lamp
         lamp_light.on = bool(lamp)
-        for body in self.bodies:
-            body.light(bool(lamp))
-        for ground in self.grounds:
-            ground.light(bool(lamp))
+        for body in (*self.bodies, *self.grounds) if lamp is not None else ():
+            body.light(lamp)
         background = self.settings.background
         dark = lamp or lamp is None or background == "transparent"
         self.plotter.set_background("black" if dark else background)
@@ -468,12 +466,13 @@ class _Body:
             look_up = {"scalars": FIELD, "clim": (0.0, top), "cmap": COLORS, "show_scalar_bar": False}
             if kind == "obstacle":  # where nothing presses it keeps its colour
                 look_up.update(clim=(UNLOADED * top, top), below_color=color)
-        edges = settings.edges if look.edges is None else look.edges
+        self.wireframe = settings.wireframe
+        self.edges = (settings.edges if look.edges is None else look.edges) and not self.wireframe
         self.actor = plotter.add_mesh(
             self.mesh,
             **look_up,
-            style="wireframe" if settings.wireframe else "surface",
-            show_edges=edges and not settings.wireframe,
+            style="wireframe" if self.wireframe else "surface",
+            show_edges=self.edges,
             edge_color=EDGE,
             line_width=OVERSAMPLED,
             smooth_shading=self.smooth,
@@ -510,9 +509,17 @@ class _Body:
         self.actor.prop.ambient = 0.0 if lamp else 0.55 if glass else AMBIENT
         self.actor.prop.diffuse = 0.0 if lamp and glass else DIFFUSE
 
+    def show(self, shown: bool, alone: bool = False) -> None:
+        """Whether it is drawn; alone: without lines."""
+        self.actor.visibility = shown
+        if self.outline is not None:
+            self.lines.visibility = shown and not alone
+
     def flat(self, color: list[int] | None) -> None:
-        """A colour as it is, whatever the light; None: as before."""
+        """A colour as it is, whatever the light, and no lines; None: as before."""
         prop = self.actor.prop
+        prop.show_edges = self.edges and color is None
+        prop.style = "wireframe" if self.wireframe and color is None else "surface"
         self.actor.mapper.scalar_visibility = self.field and color is None
         prop.lighting = color is None
         prop.color = self.color if color is None else color
@@ -594,6 +601,10 @@ class _Ground:
         along = (points - center) @ axes.T
         reach = np.minimum(along.max(axis=0), -along.min(axis=0))[:2].min()
         return len(points) >= 4 and bool(extents[2] < 1e-6 * extents[0]) and reach > 0.9 * radius
+
+    def show(self, shown: bool, alone: bool = False) -> None:
+        """Whether it is drawn."""
+        self.actor.visibility = shown
 
     def light(self, lamp: bool) -> None:
         """What it shows of the one light or the other."""

@@ -16,6 +16,7 @@ run.vtkhdf alone grows in place: it is derived from the frames and written anew 
 """
 
 import errno
+import importlib
 import json
 import math
 import numbers
@@ -365,6 +366,14 @@ class Run:
     def skins(self) -> list[Skin]:
         """What is drawn of each body."""
         return [self.skin(body) for body in range(len(self.body_names))]
+
+    def _repr_html_(self) -> str:
+        """The last frame and a summary, for notebooks."""
+        return importlib.import_module("pdipc.output.inline").html_of_run(self)  # by name: see there
+
+    def show(self, height: int = 500) -> Any:
+        """Plays it in a frame of a notebook, `height` pixels high; `close()` of what is returned ends it. Needs the extra "viewer"."""
+        return importlib.import_module("pdipc.output.inline").show_run(self, height)
 
     def segments(self) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
         """Step, outer iteration, start (n, 3) and end (n, 3) of every motion recorded for the frames that count."""

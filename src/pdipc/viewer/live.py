@@ -1,7 +1,7 @@
 """A scene that is simulated while it is watched, and whose bodies are dragged."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -263,10 +263,10 @@ class Live:
         except OSError:  # while an editor replaces it
             return None
 
-    def loop(self) -> None:
-        """Simulates and shows until an exception such as KeyboardInterrupt; raises what ended the simulation."""
+    def loop(self, over: Callable[[], bool] = lambda: False) -> None:
+        """Simulates and shows until `over()` or an exception such as KeyboardInterrupt; raises what ended the simulation."""
         self.engine.start()
-        while True:
+        while not over():
             if self.engine.error is not None:
                 self.report.content = f"**The simulation ended:** {self.engine.error}"
                 raise self.engine.error

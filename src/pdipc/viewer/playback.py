@@ -1,7 +1,7 @@
 """A run that is played back."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,10 +75,10 @@ class Playback:
             self._field = pressure(self.run, list(range(self.run.frame_count)))
         return np.where(self.run.obstacle, 0.0, self._field.values(frame)), self._field.top
 
-    def loop(self) -> None:
-        """Plays until an exception such as KeyboardInterrupt."""
+    def loop(self, over: Callable[[], bool] = lambda: False) -> None:
+        """Plays until `over()` or an exception such as KeyboardInterrupt."""
         last = time.monotonic()
-        while True:
+        while not over():
             time.sleep(IDLE)
             now = time.monotonic()
             self.advance(now - last)
