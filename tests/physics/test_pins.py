@@ -192,3 +192,15 @@ def test_exact_pins_may_share_vertices_one_after_the_other():
     pins[1]["start"] = 0.05
     (found,) = pdipc.check_scene(scene([cloth("sheet", (1, 1), (1, 1), pins=pins)]))
     assert "4 vertices are held exactly by more than one pin at a time" in str(found)
+
+
+def test_pins_are_saved_and_read_as_they_are(tmp_path):
+    pins = [
+        {"select": {"seam": True}, "axes": "zx", "stiffness": 2.0, "start": 0.5},
+        {"select": {"vertices": [0]}, "follow": "floor", "end": 1.0},
+    ]
+    made = scene([cloth("sheet", (1, 1), (1, 1), at=(0, 1, 0), pins=pins)], [floor()])
+    made.save(tmp_path / "scene.toml")
+    assert pdipc.load_scene(tmp_path / "scene.toml") == made
+    assert made.bodies[0].pins[0].axes == "xz"
+    assert "selects no vertex" in str(pdipc.check_scene(made)[0])

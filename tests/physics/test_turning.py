@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 import pdipc
+from pdipc.device.launch import Device
+from pdipc.judge.certify import certify
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import CHORD, MOST
 from pdipc.scene.schema import Keyframe, Motion
 from physics.scenes import cloth, scene, solid
 
-H, SEPARATION, LENGTH = 0.01, 4e-3, 0.4
-CONTACT = {"minimum_separation": SEPARATION, "activation_distance": 4e-3}
+H, SEPARATION, LENGTH = 0.01, 8e-3, 0.4
+CONTACT = {"minimum_separation": SEPARATION, "activation_distance": 8e-3}
 
 
 def bar(turns, **more):
@@ -28,7 +30,7 @@ def fitted(points, start):
 
 
 class Arcs:
-    """Judges every committed motion along the true arcs of a bar that turns about z: a rigid bar at each part of the way, all else straight."""
+    """Judges every committed motion along the true arcs of a bar that turns about z through its middle: a rigid bar at each part of the way, all else straight."""
 
     def __init__(self, simulation):
         assembly = simulation.model.assembly
@@ -43,12 +45,15 @@ class Arcs:
         self.pushed = max(self.pushed, np.linalg.norm(x_end[self.free] - self.rest, axis=1).max(initial=0.0))
         begin, end = (fitted(each[self.bar], self.start) for each in (x, x_end))
         self.furthest = max(self.furthest, np.linalg.norm(end - x_end[self.bar], axis=1).max())
-        angle = np.arctan2(np.cross(begin, end)[0, 2], (begin[0, :2] * end[0, :2]).sum())
+        middle, motion = begin.mean(axis=0), (end - begin).mean(axis=0)
+        arm, arm_end = begin[0] - middle, end[0] - middle - motion
+        angle = np.arctan2(np.cross(arm, arm_end)[2], (arm[:2] * arm_end[:2]).sum())
         self.turned += angle
         for part in (0.5, 1.0):
             moved = x + part * (x_end - x)
             c, s = np.cos(part * angle), np.sin(part * angle)
-            moved[self.bar] = begin @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            moved[self.bar] = (begin - middle) @ turn.T + middle + part * motion
             found = pdipc.find_intersections(moved, self.triangles, self.obstacle)
             assert not len(found), f"triangles {found[:3].tolist()} meet on the arc"
 
@@ -59,7 +64,7 @@ def judged(bodies, obstacle, **more):
     return simulation
 
 
-@pytest.mark.parametrize("turns", [0.13, 0.5, -1.0])
+@pytest.mark.parametrize("turns", [0.5, -1.0])
 def test_a_turning_bar_carries_a_cloth_along(turns):
     """The cloth stands in the way of the bar's end; on chords of half and whole turns the bar would not touch it at all."""
     sheet = cloth("sheet", (0.06, 0.1), (2, 2), at=(0.15, np.sign(turns) * 0.05, 0.0))
@@ -104,7 +109,7 @@ def test_other_solvers_follow_arcs_too(method):
     )
     simulation.observe = Arcs(simulation)
     result = simulation.step()
-    assert result.chords > 10 or result.lag > 0.0
+    assert result.chords > 8 or result.lag > 0.0
     assert simulation.observe.furthest <= 4 * CHORD * SEPARATION
     assert simulation.observe.pushed > 0.02, "it gives way"
 
@@ -156,3 +161,29 @@ def test_what_turns_too_fast_is_refused_before_anything_is_launched():
     assert f"at most {MOST}: take a shorter time_step or more substeps, or a larger minimum separation" in str(found)
     made.simulation.substeps = 6
     assert pdipc.check_scene(made) == []
+
+
+def test_certificates_hold_along_the_chords(tmp_path):
+    """The judge replays every chord of a run, among them those on which the bar carries the cloth."""
+    pytest.importorskip("ipctk")
+    sheet = cloth("sheet", (0.06, 0.1), (1, 1), at=(0.15, 0.05, 0.0))
+    made = scene([sheet], [bar(0.2)], contact=CONTACT, gravity=[0, 0, 0], time_step=H, steps=2)
+    pdipc.run_scene(made, tmp_path / "run", certify=True)
+    run = pdipc.open_run(tmp_path / "run")
+    certificate = certify(run)
+    assert certificate.hits == []
+    assert certificate.segments >= sum(record["chords"] for record in run.stats) > 8
+    assert certificate.smallest_gap > 0.0
+
+
+def test_chords_and_commands_give_the_same_bits_for_any_number_of_threads():
+    ends = []
+    for threads in (1, 3):
+        sheet = cloth("sheet", (0.06, 0.1), (3, 3), at=(0.15, 0.05, 0.0))
+        made = scene([sheet], [bar(0.1), {**bar(0.0), "name": "tool", "translation": [0.0, 0.3, 0.0]}], contact=CONTACT)
+        simulation = pdipc.Simulation(pdipc.build(made, Device("cpu", threads=threads)))
+        simulation.set_pose("tool", position=(0.0, 0.2, 0.0), rotation=(0.0, 0.0, 40.0))
+        for _ in range(2):
+            simulation.step()
+        ends.append(simulation.checkpoint())
+    assert all(np.array_equal(ends[0][name], ends[1][name]) for name in ends[0])
