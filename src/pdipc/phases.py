@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdipc.integration.script import anchored_pins
+from pdipc.integration.script import rows_of_anchors
 from pdipc.model import Model, State, reassembled
 from pdipc.scene.assembly import AssembledPin, Assembly
 from pdipc.scene.motion import Glue, Trajectory, pulled_back
@@ -24,28 +24,18 @@ def model_at(model: Model, state: State) -> Model:
     due = [pin.start <= time < pin.end for pin in assembly.pins]
     if all(pin.active == now for pin, now in zip(assembly.pins, due, strict=True)):
         return model
-    pins = []
+    pins, anchors = [], rows_of_anchors(assembly)
     for number, (pin, now) in enumerate(zip(assembly.pins, due, strict=True)):
+        new = replace(pin, active=now)
         if now and not pin.active and pin.start > 0.0:
-            if f"{number}_points" not in state.reached.caught:
+            caught_before = f"{number}_points" in state.reached.caught
+            if not caught_before:
                 state.reached.caught |= _catch(assembly, pin, number, state)
-            pin = _caught(pin, number, state.reached.caught)
-        pins.append(replace(pin, active=now))
-    after = replace(assembly, pins=pins)
-    state.reached.anchors = _anchors(assembly, after, state)
-    return reassembled(model, after)
-
-
-def _anchors(before: Assembly, after: Assembly, state: State) -> np.ndarray:
-    """(k, 3) m: where springs of pins end, of those that go on where they were."""
-    old, ends = anchored_pins(before), np.cumsum([0, *(len(before.pins[pin].vertices) for pin in anchored_pins(before))])
-    known = len(state.reached.anchors) == ends[-1]
-    parts = [np.zeros((0, 3))]
-    for pin in anchored_pins(after):
-        k = old.index(pin) if pin in old and known else -1
-        own = after.pins[pin]
-        parts.append(after.pin_targets(own, state.time) if k < 0 else state.reached.anchors[ends[k] : ends[k + 1]])
-    return np.concatenate(parts)
+            new = _caught(new, number, state.reached.caught)
+            if number in anchors and not caught_before:
+                state.reached.anchors[anchors[number]] = assembly.pin_targets(new, state.time)
+        pins.append(new)
+    return reassembled(model, replace(assembly, pins=pins))
 
 
 def _catch(assembly: Assembly, pin: AssembledPin, number: int, state: State) -> dict[str, np.ndarray]:

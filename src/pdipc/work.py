@@ -90,11 +90,11 @@ class Work:
     def set_scripted(self, state: State) -> None:
         """Where kinematic vertices go in a step from `state`, only uploaded where they move, and the external accelerations."""
         self.script.plan(state.time, state.reached, state.positions)
-        projector, anchors, rails = self.model.projector, self.script.anchors, self.script.on_rails
-        if anchors is not None:
-            for points, own in ((projector.anchors, anchors[~rails]), (projector.rails, anchors[rails])):
+        projector, script = self.model.projector, self.script
+        if script.anchors is not None:
+            for points, own in ((projector.anchors, script.to_points), (projector.rails, script.on_rails)):
                 if points is not None:
-                    points.assign(own)
+                    points.assign(script.anchors[own])
         self.model.set_time(state.time + self.model.settings.time_step)
         self.loads.update(state.time, state.positions, state.velocities)
 

@@ -185,7 +185,7 @@ class Reached:
 
     times: (bodies,) s, in its script; of bodies, and of what follows none, the time of the state. poses: (bodies, 7), the turn from the start as a
     quaternion x, y, z, w and the place of the origin, m, of what is led by a command; else 0. anchors: (k, 3) m, the points that the springs of
-    pins end at, pin by pin. caught: by which points pins that began later hold, arrays by name (`phases`).
+    pins end at, pin by pin, also of those that do not hold now. caught: by which points pins that began later hold, arrays by name (`phases`).
     """
 
     times: np.ndarray
@@ -197,7 +197,7 @@ class Reached:
     def at(cls, time: float, assembly: Assembly) -> "Reached":
         """Everybody in time."""
         bodies = len(assembly.bodies)
-        anchors = [assembly.pin_targets(assembly.pins[pin], time) for pin in anchored_pins(assembly)]
+        anchors = [assembly.pin_targets(assembly.pins[pin], time) for pin in rows_of_anchors(assembly)]
         return cls(np.full(bodies, time), np.zeros((bodies, 7)), np.concatenate([np.zeros((0, 3)), *anchors]))
 
     def copy(self) -> "Reached":
@@ -228,16 +228,21 @@ class Reached:
         return Rotation.from_matrix(rotation), rotation @ (mover.origin - path.center) + path.center + p
 
 
-def anchored_pins(assembly: Assembly) -> list[int]:
-    """The pins that hold by springs to points, in the order of `Projector.anchors`."""
-    return [number for number, pin in enumerate(assembly.pins) if pin.anchored]
+def rows_of_anchors(assembly: Assembly) -> dict[int, slice]:
+    """The pins that hold by springs to points, at some time, in the order of `Projector.anchors`, and their rows in `Reached.anchors`."""
+    rows, end = {}, 0
+    for number, pin in enumerate(assembly.pins):
+        if pin.stiffness is not None and pin.follow < 0:
+            rows[number] = slice(end, end + len(pin.vertices))
+            end += len(pin.vertices)
+    return rows
 
 
 class Script:
     """The movers of a simulation, and what leads them.
 
-    leads: commands, by the key of a mover, or -1 less the number of a pin that holds by springs. anchors: (k, 3) m, where those end; on_rails: (k,)
-    bool, which hold along some axes only.
+    leads: commands, by the key of a mover, or -1 less the number of a pin that holds by springs. anchors: (k, 3) m, where those end; to_points,
+    on_rails: (k,) bool, which hold now along all axes, and along some.
 
     target: (n,) vec3, m, where each scripted vertex goes in this outer iteration; goal: in this step. mover: (n,) int32, -1 for none.
     drive, crowded: (movers,) int32, who goes on in this outer iteration, and who has a pair that is squeezed. flags: (3,) int32, whether
@@ -249,10 +254,12 @@ class Script:
         self.assembly, self.device, self.real, self.h, self.kernels = assembly, device, real, h, kernels(real)
         self.movers, self.generation = movers_of(assembly), 0
         self.leads: dict[int, Lead] = {}
-        self.soft = anchored_pins(assembly)
+        self.soft = rows_of_anchors(assembly)
         self.anchors: np.ndarray | None = None
-        rails = [np.full(len(assembly.pins[pin].vertices), not assembly.pins[pin].axes.all()) for pin in self.soft]
-        self.on_rails = np.concatenate([np.zeros(0, dtype=bool), *rails])
+        held = [np.full(len(assembly.pins[pin].vertices), assembly.pins[pin].active) for pin in self.soft]
+        whole = [np.full(len(assembly.pins[pin].vertices), assembly.pins[pin].axes.all()) for pin in self.soft]
+        held, whole = (np.concatenate([np.zeros(0, dtype=bool), *parts]) for parts in (held, whole))
+        self.to_points, self.on_rails = held & whole, held & ~whole
         self._ways: list[Way] = []
         self._late = ""
         n, count = len(assembly.positions), max(1, len(self.movers))
@@ -358,15 +365,15 @@ class Script:
     def _plan_anchors(self, end: float, reached: Reached) -> None:
         if not self.soft:
             return
-        pins = [self.assembly.pins[pin] for pin in self.soft]
-        ends = np.cumsum([0, *(len(pin.vertices) for pin in pins)])
-        self.anchors = np.empty((ends[-1], 3))
-        for k, pin in enumerate(pins):
-            own, lead = slice(ends[k], ends[k + 1]), self.leads.get(-1 - self.soft[k])
+        self.anchors = np.empty_like(reached.anchors)
+        for pin, own in self.soft.items():
+            lead = self.leads.get(-1 - pin)
             if lead is None or lead.points is None:
-                self.anchors[own] = self.assembly.pin_targets(pin, end)
-            else:
+                self.anchors[own] = self.assembly.pin_targets(self.assembly.pins[pin], end)
+            elif self.assembly.pins[pin].active:
                 self.anchors[own] = _towards(reached.anchors[own], lead.points, lead.speed * self.h)
+            else:
+                self.anchors[own] = reached.anchors[own]
 
     def _led(self, mover: Mover, lead: Lead, reached: Reached, positions: wp.array) -> Way:
         """A command's way, as far as its speed takes it in a step."""
