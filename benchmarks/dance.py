@@ -87,9 +87,12 @@ def main() -> None:
     model, steps = simulation.model, options.steps or made.simulation.steps
     skirt = model.assembly.bodies[0]
     topology = {"triangles": model.triangles, **model.assembly.topology()}
-    writer = RunWriter.create(
-        options.out, json.dumps({"simulation": {"steps": steps}}), topology, {"precision": model.real.name}, True
-    )
+    said = {
+        "simulation": {"steps": steps},
+        "bodies": [{"name": "skirt"}],
+        "obstacles": [{"name": "body"}],
+    }  # without 100 MB of vertices
+    writer = RunWriter.create(options.out, json.dumps(said), topology, {"precision": model.real.name}, overwrite=True)
     began, records = time.monotonic(), []
     with writer:
         writer.append(0, 0.0, simulation.positions, {})
