@@ -81,3 +81,46 @@ def test_bad_requests_are_refused(run, tmp_path):
     (writer.folder / "stats.jsonl").write_text("")
     with pytest.raises(RunError, match="no frames"):
         export(open_run(writer.folder), "ply", tmp_path / "out")
+
+
+def test_paraview_has_a_piece_for_each_body(tmp_path):
+    """As VTK's own reader finds it: pieces by name, at each time, with velocities that are differences and pressures of contact."""
+    import pdipc
+
+    vtk_io = pytest.importorskip("vtkmodules.vtkIOHDF")
+    pyvista = pytest.importorskip("pyvista")
+    body = {"kind": "solid", "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [1, 1, 1]}}
+    scene = pdipc.Scene(
+        bodies=[
+            {"name": "low", "translation": [0.0, 0.0503, 0.0], **body},
+            {"name": "high", "translation": [0.0, 0.5, 0.0], "material": {"young_modulus": 1e6}, **body},
+        ],
+        obstacles=[{"name": "floor", "mesh": {"shape": "plane"}}],
+        contact={"activation_distance": 1e-3},
+    )
+    pdipc.run_scene(scene, tmp_path / "run", steps=3, device="cpu")
+    run = open_run(tmp_path / "run")
+    reader = vtk_io.vtkHDFReader()
+    reader.SetFileName(str(export(run, "paraview", tmp_path / "run.vtkhdf")))
+    reader.UpdateInformation()
+    of_vertex = run.topology["body_of_vertex"]
+    assert reader.GetNumberOfSteps() == 4
+    for frame in range(4):
+        reader.SetStep(frame)
+        reader.Update()
+        found = reader.GetOutput()
+        assert found.GetNumberOfPartitionedDataSets() == 3
+        for number, name in enumerate(("low", "high", "floor")):
+            assert found.GetMetaData(number).Get(found.NAME()) == name
+            mesh = pyvista.wrap(found.GetPartition(number, 0))
+            own = of_vertex == number
+            np.testing.assert_allclose(mesh.points, run.positions(frame)[own], rtol=0, atol=1e-7)
+            np.testing.assert_allclose(mesh["displacement"], (run.positions(frame) - run.positions(0))[own], rtol=0, atol=1e-7)
+            assert set(mesh["body"]) == {number}
+            assert set(mesh["material"]) == {(0, 1, -1)[number]}
+            if frame:
+                velocity = (run.positions(frame) - run.positions(frame - 1))[own] / 0.01
+                np.testing.assert_allclose(mesh["velocity"], velocity, rtol=1e-5, atol=1e-5)
+            assert (mesh["pressure"].max() > 0.0) == (name != "high")
+    with pytest.raises(ValueError, match=r"ends in .vtkhdf"):
+        export(run, "paraview", tmp_path / "run.vtk")

@@ -23,6 +23,7 @@ class Format(StrEnum):
     ply = "ply"
     obj = "obj"
     vtk = "vtk"
+    paraview = "paraview"
 
 
 class Color(StrEnum):
@@ -250,7 +251,7 @@ def export(
         typer.Option(
             "--format",
             help="usd: one animated file; stage: a layer over the USD stage that the scene's meshes came from; mdd, pc2: point caches, a "
-            "file a body; ply, obj: a file a frame; vtk: PVD and VTU.",
+            "file a body; ply, obj: a file a frame; vtk: PVD and VTU; paraview: one file with a piece a body, velocity, displacement and pressure.",
         ),
     ],
     out: Annotated[Path | None, typer.Option("--output", "-o", metavar="PATH", help="Default: beside the run folder.")] = None,
@@ -271,7 +272,7 @@ def export(
     outside_of_runs(out)
     opened = open_run(folder)
     resolved = folder.resolve()
-    suffix = {Format.usd: ".usdc", Format.stage: "_stage.usda"}.get(to, f"_{to.value}")
+    suffix = {Format.usd: ".usdc", Format.stage: "_stage.usda", Format.paraview: ".vtkhdf"}.get(to, f"_{to.value}")
     default = resolved.with_name(resolved.name + suffix)
     typer.echo(str(exports.export(exports.Excerpt(opened, every, bodies or None), to.value, out or default, fps)))
 

@@ -5,14 +5,16 @@ from pathlib import Path
 import numpy as np
 
 from pdipc.output import point_cache, usd
+from pdipc.output.paraview import export_paraview
 from pdipc.output.results import Run, RunError
 
-FORMATS = ("usd", "stage", "mdd", "pc2", "ply", "obj", "vtk")
+FORMATS = ("usd", "stage", "mdd", "pc2", "ply", "obj", "vtk", "paraview")
 
 
 class Excerpt(Run):
     """Every so many frames of a run, and of its bodies only those of the given names, with their copies; all where None.
 
+    whole: the run; taken: the frames; vertices: (k,) its vertices.
     Raises RunError for a name that the run does not have.
     """
 
@@ -24,10 +26,10 @@ class Excerpt(Run):
             )
         kept = [bodies is None or bool({name, short} & set(bodies)) for name, short in zip(run.body_names, base, strict=True)]
         of_vertex = run.topology["body_of_vertex"]
-        self._run, self._every = run, every
-        self._vertices = np.flatnonzero(np.array(kept)[of_vertex])
+        self.whole, self.taken = run, list(range(run.frame_count))[::every]
+        self.vertices = np.flatnonzero(np.array(kept)[of_vertex])
         number = np.full(len(of_vertex), -1, dtype=np.int32)
-        number[self._vertices] = np.arange(len(self._vertices))
+        number[self.vertices] = np.arange(len(self.vertices))
 
         def own(elements: np.ndarray) -> np.ndarray:
             return number[elements[np.array(kept)[of_vertex[elements[:, 0]]]]].reshape(-1, elements.shape[1])
@@ -36,8 +38,8 @@ class Excerpt(Run):
         self.topology = {
             "triangles": own(run.triangles),
             "tets": own(run.tets),
-            "body_of_vertex": (np.cumsum(kept) - 1)[of_vertex[self._vertices]],
-            "scripted": run.scripted[self._vertices],
+            "body_of_vertex": (np.cumsum(kept) - 1)[of_vertex[self.vertices]],
+            "scripted": run.scripted[self.vertices],
             "body_names": run.topology["body_names"][kept],
             "body_kinds": run.topology["body_kinds"][kept],
             "body_radii": run.topology["body_radii"][kept],
@@ -45,7 +47,7 @@ class Excerpt(Run):
 
     def positions(self, frame: int) -> np.ndarray:
         """(k, 3) m, of the vertices that the excerpt has."""
-        return self._run.positions(range(self._run.frame_count)[:: self._every][frame])[self._vertices]
+        return self.whole.positions(self.taken[frame])[self.vertices]
 
 
 def export(run: Run, to: str, path: str | Path, fps: float | None = None) -> Path:
@@ -61,7 +63,7 @@ def export(run: Run, to: str, path: str | Path, fps: float | None = None) -> Pat
     if fps is not None and to != "usd":
         raise ValueError(f"frames a second can be chosen for usd, not for {to}")
     path = Path(path)
-    (path.parent if to in ("usd", "stage") else path).mkdir(parents=True, exist_ok=True)
+    (path.parent if to in ("usd", "stage", "paraview") else path).mkdir(parents=True, exist_ok=True)
     if to == "usd":
         return usd.export_usd(run, path, fps)
     writers = {
@@ -71,6 +73,7 @@ def export(run: Run, to: str, path: str | Path, fps: float | None = None) -> Pat
         "ply": export_ply,
         "obj": export_obj,
         "vtk": export_vtk,
+        "paraview": export_paraview,
     }
     return writers[to](run, path)
 
