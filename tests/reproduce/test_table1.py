@@ -53,7 +53,7 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
     assert "Here" in told.output and "every frame judged by the witness" in told.output.replace("\n", " ")
     written = json.loads((tmp_path / "table1.json").read_text())
     assert written["machine"] and len(written["rows"]) == 2
-    for name in ("dragon.png", "table1.png"):
+    for name in ("dragon.png", "scenes.png", "table1.png"):
         assert (tmp_path / name).stat().st_size > 20_000
     before = open_run(tmp_path / "dragon-default").positions(-1)
 
@@ -114,6 +114,12 @@ def test_paper_mode_keeps_the_bodies():
     printed = table1.paper_mode(scene, 3)
     assert printed.contact.method == "paper" and printed.contact.friction == 0.0 and printed.simulation.solver_order == 3
     assert printed.model_dump(include={"bodies", "forces"}) == scene.model_dump(include={"bodies", "forces"})
+
+
+def test_paper_mode_takes_every_row():
+    """Also that whose closed cloth is filled, which the mode cannot do."""
+    for row in ("halloween", "skirt"):
+        assert check(table1.paper_mode(load_scene(table1.ROWS[row].bundled), 2)) == []
 
 
 def test_filled(tmp_path, monkeypatch):
