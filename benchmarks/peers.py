@@ -6,7 +6,8 @@ Same meshes, materials, masses, step of 1/100 s and number of steps; each solver
 
 What differs, and has to be known to read the table:
 - pdipc ends a step when it has converged (tolerance 0.01 m/s), in float64; SolverVBD after --iterations sweeps of each of --substeps substeps, in
-  float32, whatever is left then. `height` is the mean height of the bodies' vertices at the end, to see how far they agree on the motion.
+  float32, whatever is left then. `height` is the mean height of the bodies' vertices after the last step that all took, to see how far
+  they agree on the motion.
 - "newton": obstacles are mesh shapes, which particles of RADIUS keep away from by a penalty; self-contact is on. "newton, truncated": with its
   penetration-free truncation against shapes as well (rigid_soft_enable_dat), and contact of whole surfaces.
 - Intersections are judged by the witness, obstacles where the script has them; SolverVBD keeps RADIUS between surfaces, so any is a failure of its own.
@@ -200,8 +201,8 @@ def inverted(x: np.ndarray, tets: np.ndarray) -> int:
     return int((np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) <= 0).sum())
 
 
-def measure(name: str, side: str, options: argparse.Namespace, folder: Path) -> dict:
-    """A row: one solver on one scene, in a process of its own."""
+def measure(name: str, side: str, options: argparse.Namespace, folder: Path) -> tuple[dict, np.ndarray]:
+    """A row, and the mean height of bodies after each step, m: one solver on one scene, in a process of its own."""
     import pdipc
     from pdipc.scene.assembly import assemble
 
@@ -221,7 +222,7 @@ def measure(name: str, side: str, options: argparse.Namespace, folder: Path) -> 
         len(pdipc.find_intersections(x, assembly.triangles, assembly.obstacle)) if good else -1
         for x, good in zip(frames, finite, strict=True)
     ]
-    return {
+    row = {
         "scene": name,
         "solver": side,
         "steps": len(frames) - 1,
@@ -234,9 +235,10 @@ def measure(name: str, side: str, options: argparse.Namespace, folder: Path) -> 
         "most_pairs": max(pairs),
         "inverted_tets": max(inverted(x, assembly.tets) for x in frames[finite]) if len(assembly.tets) else 0,
         "finite": bool(finite.all()),
-        "height_m": float(frames[-1][~assembly.obstacle, 2].mean()),
         "peak_memory_mb": memory,
+        "load": os.getloadavg()[0],
     }
+    return row, frames[:, ~assembly.obstacle, 2].mean(axis=1)
 
 
 def main() -> None:
@@ -273,20 +275,19 @@ def main() -> None:
     )
     options.output.parent.mkdir(exist_ok=True)
     for name in options.scenes:
-        for side in options.sides:
-            with tempfile.TemporaryDirectory() as folder:
-                row = measure(name, side, options, Path(folder))
-            row["load"] = os.getloadavg()[0]
+        with tempfile.TemporaryDirectory() as folder:
+            measured = [measure(name, side, options, Path(folder)) for side in options.sides]
+        common = min(row["steps"] for row, _ in measured)
+        for row, heights in measured:
+            row |= {"common_step": common, "height_m": float(heights[common])}
             report["rows"].append(row)
             missed = "" if row["unconverged"] is None else row["unconverged"]
             print(
-                f"{name:6} {side:18} {row['steps']:5} {row['median_processor_ms']:10.1f} {row['worst_processor_ms']:9.1f} {missed:>6} "
-                f"{row['intersecting_frames']:6} {row['inverted_tets']:8} {row['height_m']:8.4f}",
+                f"{name:6} {row['solver']:18} {row['steps']:5} {row['median_processor_ms']:10.1f} {row['worst_processor_ms']:9.1f} "
+                f"{missed:>6} {row['intersecting_frames']:6} {row['inverted_tets']:8} {row['height_m']:8.4f} after {common}",
                 flush=True,
             )
-            options.output.write_text(
-                json.dumps(report, indent=1) + "\n"
-            )  # what was measured stays, whatever happens to the rest
+        options.output.write_text(json.dumps(report, indent=1) + "\n")  # what was measured stays, whatever happens to the rest
 
 
 if __name__ == "__main__":
