@@ -14,7 +14,7 @@ from pdipc.device import sums
 from pdipc.device.precision import real
 from pdipc.integration import inertia, script
 from pdipc.integration import loads as forces
-from pdipc.linear import block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
+from pdipc.linear import affine, block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
 from pdipc.nonlinear import anderson, local_global, newton
 from pdipc.paper_mode import energy_rate, printed
 from pdipc.paper_mode import targets as paper
@@ -37,6 +37,7 @@ FACTORIES = {
     "wide modes": wide_modes.kernels,
     "wide couplings": lambda precision: {"a": exact.wide_coupling(precision), "b": friction.wide_coupling(precision)},
     "wide pcg": lambda precision: wide_pcg.kernels(precision, exact.operator(precision), friction.operator(precision)),
+    "affine": affine.kernels,
     "flags": lambda precision: {"positive": newton._positive(precision)},
     "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),

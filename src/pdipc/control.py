@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from pdipc.device.launch import one_at_a_time
 from pdipc.integration.script import Lead
 from pdipc.model import Model, State
+from pdipc.rigid import torn
 from pdipc.scene.assembly import AssembledBody, AssembledPin
 from pdipc.scene.check import LARGEST, check_placed
 from pdipc.scene.motion import rotation_matrix
@@ -140,6 +141,8 @@ class Controls:
                     f'vertex {stuck[0]} of body "{body}" is held exactly at {before[own][stuck[0]].tolist()} m; it must stay, or be led with '
                     "set_pin"
                 )
+        if wrong := torn(assembly, x.astype(np.float64)):
+            raise ValueError(f"bodies cannot be put there: {wrong}")
         for body in positions:
             if found := check_placed(assembly, x.astype(np.float64), precision, assembly.bodies.index(self._body(body))):
                 raise ValueError("\n  ".join([f'body "{body}" cannot be put there:', *map(str, found)]))
@@ -161,6 +164,8 @@ class Controls:
         wanted = _numbers(velocities, (which.last - which.first, 3), f'velocities of body "{body}"')
         v, own = self.state.velocities.numpy().copy(), slice(which.first, which.last)
         v[own] = np.where(self.model.free_vertices[own, None], wanted, v[own])
+        if len(which.handles):  # whose motion is that of its four points
+            v[which.first : which.first + which.count] = which.weights @ v[which.handles]
         self.state.velocities.assign(v)
 
     # Forces.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from pdipc import algorithm
+from pdipc import algorithm, rigid
 from pdipc.device.launch import one_at_a_time
 from pdipc.integration.inertia import CHORDS, FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
@@ -164,6 +164,9 @@ def _belongs(model: Model, state: State, work: Work) -> None:
 
 def _judge(model: Model, state: State, work: Work) -> None:
     assembly, triangles = model.assembly, model.triangles
+    if wrong := rigid.torn(assembly, state.positions.numpy().astype(np.float64)):
+        work.x.fill_(wp.nan)  # so that it is judged again
+        raise ValueError(f"the state at t = {state.time:g} s cannot be: {wrong}")
     pairs = find_intersections(state.positions.numpy(), triangles, assembly.obstacle)
     pairs = pairs[~work.quarantine.excuses(pairs, state.quarantined)]
     if len(pairs):

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from pdipc import cloth, constraints, rods
+from pdipc import cloth, constraints, rigid, rods
 from pdipc.collision import surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.constraints import (
@@ -28,13 +28,14 @@ from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
 from pdipc.integration.loads import ExternalForces
 from pdipc.integration.script import Reached
+from pdipc.linear.affine import Follower
 from pdipc.linear.solver import Solver
 from pdipc.linear.solvers import make_solver
 from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
-from pdipc.scene.schema import ClothMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
+from pdipc.scene.schema import ClothMaterial, RigidMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -122,6 +123,7 @@ class Model:
     its body is stopped as a whole within a step (barrier/restitution.py), 1 where kinematic.
     solver: of the local-global method, else None. free_vertices: (n,) bool; held: (n,) kg/s^2, what a common motion of all costs each:
     mass over h^2, damping, attachments to points. external: what the scene says; each simulation has a copy. triangles: (m, 3) int32, all surfaces.
+    followers: of rigid bodies, whose vertices move as four points do.
     """
 
     scene: Scene
@@ -145,6 +147,7 @@ class Model:
     surface: surface.Surface
     external: ExternalForces
     triangles: np.ndarray
+    followers: list[Follower]
 
     @property
     def has_friction(self) -> bool:
@@ -274,7 +277,8 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
         if body.kind == "rod":
             per_vertex["rest_separation"][own] = ROD_SEPARATION
         if not body.kinematic:
-            per_vertex["kappa"][own] = scene.contact.stiffness_scale * mass[own].mean() / (h * h)
+            typical = mass[own].sum() / body.count if len(body.handles) else mass[own].mean()
+            per_vertex["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
             per_vertex["body_mass"][own] = mass[own].sum()
             crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / _speed_of_sound(body.material)
             per_vertex["rigidity"][own] = h**2 / (h**2 + crossing**2)
@@ -320,6 +324,9 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
         surface=skin,
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
         triangles=assembly.triangles,
+        followers=[
+            Follower(b.handles, np.arange(b.first, b.first + b.count), b.weights) for b in assembly.bodies if len(b.handles)
+        ],
     )
 
 
@@ -342,10 +349,12 @@ def _tolerance(sim, assembly: Assembly) -> float:
     return min(TOLERANCE_SPEED * h, TOLERANCE_PART * smallest)
 
 
-def _speed_of_sound(of: SolidMaterial | ClothMaterial | RodMaterial) -> float:
+def _speed_of_sound(of: SolidMaterial | ClothMaterial | RodMaterial | RigidMaterial) -> float:
     """m/s, along the body."""
     if isinstance(of, SolidMaterial):
         return float(np.sqrt(of.young_modulus / of.density))
+    if isinstance(of, RigidMaterial):
+        return float(np.sqrt(of.shape_stiffness / of.density))
     if isinstance(of, RodMaterial):
         assert of.stretch_stiffness is not None  # its validator has set it
         return float(np.sqrt(of.stretch_stiffness / (of.density * np.pi * of.radius**2)))
@@ -374,6 +383,10 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
             mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
         elif isinstance(m, ClothMaterial):
             own, its_mass = cloth.elasticity(assembly, body)
+            sets += own
+            mass += its_mass
+        elif isinstance(m, RigidMaterial):
+            own, its_mass = rigid.elasticity(x, body, m)
             sets += own
             mass += its_mass
         elif isinstance(m, RodMaterial):

@@ -72,7 +72,7 @@ class Work:
             len(model.assembly.quarantine),
         )
         self.quarantine = Quarantine(model.assembly)
-        self.truncation = Truncation(device, real, n, settings.per_vertex_truncation)
+        self.truncation = Truncation(device, real, n, settings.per_vertex_truncation, [b.all for b in model.followers])
         self.truncation.keep_rigid(self.script.rigid())
         self.method: Method = METHODS[settings.nonlinear_solver](self)
         self.restitution = None

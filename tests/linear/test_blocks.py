@@ -135,6 +135,43 @@ def test_solution_is_that_of_scipy(group):
     assert solver.indefinite.numpy()[0] == 0
 
 
+def test_solution_for_bodies_that_follow_four_points():
+    """J^T K J q = J^T b, densely: a rigid box under a sheet that is attached to it, both in contact, with friction, on the floor."""
+    box = {
+        "name": "box",
+        "kind": "rigid",
+        "mesh": {"shape": "box", "size": (0.2, 0.2, 0.2), "cells": (3, 2, 2)},
+        "friction": 0.3,
+    }
+    box.update(translation=(0, 0.104, 0), pins=[{"select": {"vertices": [0]}, "stiffness": 300.0}])
+    sheet = cloth(
+        "sheet", [0.3, 0.3], [5, 5], at=(0, 0.21, 0), friction=0.3, pins=[{"select": {"nearest": [0.15, 0.21, 0.15]}}]
+    )
+    ties = [{"bodies": ("sheet", "box"), "pairs": [[14, 3], [15, 4]], "stiffness": 100.0}]
+    made = scene([box, sheet], [floor(1.0, friction=0.3)], contact={"activation_distance": 1e-2})
+    model = pdipc.build(
+        made.model_copy(update={"attachments": pdipc.Scene(**{**made.model_dump(), "attachments": ties}).attachments}), "cpu"
+    )
+    work, now, contacts = assembled(model, YES)
+    n, free, matrix = model.vertex_count, model.free_vertices, work.method.matrix
+    solver = BlockPcg(model.device, model.real, matrix, free, 1e-11, 900, work.method.affine)
+    (body,) = model.followers
+    follow = np.eye(n)
+    follow[body.vertices] = 0.0
+    follow[np.ix_(body.vertices, body.handles)] = body.weights
+    unknown = free.copy()
+    unknown[body.vertices] = False
+    j = np.kron(follow[:, unknown], np.eye(3))
+    k = elastic(model, matrix) + contact_matrix(contacts, n)
+    b = np.random.default_rng(1).standard_normal((n, 3)) * free[:, None]
+    p = wp.zeros(n + 1, dtype=wp.vec3d, device="cpu")
+    solver.prepare(now, contacts)
+    solver.solve(p, wp.array(b, dtype=wp.vec3d, device="cpu"), contacts, 0.0, NO)
+    expected = j @ scipy.linalg.solve(j.T @ k @ j, j.T @ b.ravel(), assume_a="pos")
+    assert np.abs(p.numpy()[:n].ravel() - expected).max() < 1e-6 * np.abs(expected).max()
+    assert 0 < solver.iterations.numpy()[0] < 300
+
+
 def test_coarse_matrix_is_the_galerkin_product():
     """C = Z^T K Z, with barriers and friction, whose triangle is factorized in place: C^-1 Z^T r against NumPy."""
     model = crowded()

@@ -67,3 +67,8 @@ def too_near(simulation):
     """What is nearer than its minimum separation, the thickness of rods and cloth: measured without the code of the contact."""
     assembly = replace(simulation.model.assembly, positions=simulation.positions)
     return list(check.too_close(assembly, set(), "float64"))
+
+
+def clean(simulation):
+    """Whether no two triangles, nor segments of rods, intersect."""
+    return len(pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)) == 0

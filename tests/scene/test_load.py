@@ -32,11 +32,11 @@ mesh = { shape = "sphere", cells = 4 }
         ),
         ("[simulation]\nlinear_solver = 'lu'", r'linear_solver = "lu": must be .*pcg'),
         ("[contact]\ntruncation = 'none'", r'contact.truncation = "none": must be .auto., .per_vertex. or .global.'),
-        ("[[bodies]]\nname = 'a'\nmesh = 'a.obj'", r'bodies\[1\] \("a"\): needs kind = "solid", "cloth" or "rod"$'),
+        ("[[bodies]]\nname = 'a'\nmesh = 'a.obj'", r'bodies\[1\] \("a"\): needs kind = "solid", "cloth", "rod" or "rigid"$'),
         ("[[forces]]\nvelocity = [1, 0, 0]", r'forces\[0\]: needs kind = "wind" or "vertices"$'),
         ("[[forces]]\nkind = 'wind'\nvelocity = [1, 0, 0]\nbodies = []", r"forces\[0\].bodies = \[\]: .*at least 1 item"),
         ("[[obstacles]]\nname = 'o'\nmesh = 'a.obj'\ntranslation = 'up'", r'translation = "up": must be a list \(Where'),
-        ("[[bodies]]\nkind = 'clth'\nmesh = 'a.obj'", r'bodies\[1\].kind = "clth": must be "solid", "cloth" or "rod"'),
+        ("[[bodies]]\nkind = 'clth'\nmesh = 'a.obj'", r'bodies\[1\].kind = "clth": must be "solid", "cloth", "rod" or "rigid"'),
         (
             "[[bodies]]\nname = 'ball'\nkind = 'cloth'\nmesh = 'a.obj'",
             r'toml": the scene: names must be unique; used more than once: ball$',

@@ -421,7 +421,7 @@ class BarrierTerm(ActivePairs):
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
         inputs = [self.ends, self.entries, self.quads, self.lever, self.hessian]
-        if self.device.wide:
+        if modes.wide:
             modes.couple(wide_coupling(self.real), self.count, self.capacity, inputs)
         else:
             self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)

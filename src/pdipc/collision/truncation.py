@@ -18,6 +18,7 @@ drags every body of the scene (docs/paper_map.md).
 """
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -203,6 +204,16 @@ def kernels(real: Real) -> SimpleNamespace:
             multiplier[i] = wp.min(multiplier[i], least[group_of[i]])
 
     @wp.kernel(module=module)
+    def level(first: int, ends: wp.array(dtype=wp.int32), members: wp.array(dtype=wp.int32), fraction: wp.array(dtype=scalar)):
+        """The same for what their neighbours left them."""
+        r = first + wp.tid()
+        least = scalar(1.0)
+        for k in range(ends[r], ends[r + 1]):
+            least = wp.min(least, fraction[members[k]])
+        for k in range(ends[r], ends[r + 1]):
+            fraction[members[k]] = least
+
+    @wp.kernel(module=module)
     def shorten(
         first: int,
         multiplier: wp.array(dtype=wp.int32),
@@ -307,6 +318,7 @@ def kernels(real: Real) -> SimpleNamespace:
         together=together,
         find_least=find_least,
         spread_least=spread_least,
+        level=level,
         shorten=shorten,
         grade=grade,
         place=place,
@@ -319,12 +331,12 @@ class Truncation:
     """Finds x_end between x and x~, vertex by vertex, such that no candidate pair meets on the way.
 
     neighbours: offsets (n + 1,) and columns of those that elasticity
-    connects, or None. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
+    connects, or None. bodies: vertices (k,) of those that move as four points do, and so keep one time. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
     set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
     that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
     """
 
-    def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True):
+    def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True, bodies: Sequence[np.ndarray] = ()):
         self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
         self.kernels = kernels(real)
         self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
@@ -335,6 +347,7 @@ class Truncation:
         self.deep = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.neighbours: list[wp.array] | None = None
         self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
+        self.bodies = list(bodies)
         self.keep_rigid([])
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
 
@@ -344,7 +357,7 @@ class Truncation:
         if self.per_vertex and groups:
             rigid[np.concatenate(groups)] = 1
         self.rigid = wp.array(rigid, device=self.device.warp)
-        groups = groups if self.per_vertex else [np.arange(self.n)]
+        groups = [*groups, *self.bodies] if self.per_vertex else [np.arange(self.n)]
         ends = np.cumsum([0, *map(len, groups)]).astype(np.int32)
         self.group_count = len(groups)
         self.group_ends = wp.array(ends, device=self.device.warp)
@@ -417,6 +430,8 @@ class Truncation:
                 for _ in range(RINGS // 2):
                     for before, after in ((self.fraction, self.graded), (self.graded, self.fraction)):
                         device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
+                if self.bodies:
+                    device.launch(k.level, self.group_count, [self.group_ends, self.group_members, self.fraction])
             device.launch(k.place, n, [base, u, u_tilde, self.fraction, self.u_end, self.x_end])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))

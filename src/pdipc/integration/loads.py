@@ -81,6 +81,11 @@ class ExternalForces:
             force += vertex_force(each, len(force), time)
         vertices, pull = self.pulled
         np.add.at(force, vertices, pull)
+        for body in self.assembly.bodies:
+            if len(body.handles):  # what pulls at a rigid body pulls at the points that it moves as
+                own = slice(body.first, body.first + body.count)
+                force[body.handles] += body.weights.T @ force[own]
+                force[own] = 0.0
         return self.gravity + force / self.inertia[:, None]
 
     def accelerations(self, time: float, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import pcg
+from pdipc.linear.affine import AffineBodies
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import RigidModes
 
@@ -43,12 +44,23 @@ class BlockPcg:
     """Solves K p = b on the free vertices by launches alone.
 
     tolerance: relative, of sqrt(r . M^-1 r). most: iterations of a solve. iterations: (1,) int32 on the device, done since it was last set to
-    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, and ended there.
+    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, and ended there. affine: bodies whose vertices follow
+    four of them, which alone are then unknowns.
     """
 
-    def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, tolerance: float, most: int):
+    def __init__(
+        self,
+        device: Device,
+        real: Real,
+        matrix: BlockMatrix,
+        free: np.ndarray,
+        tolerance: float,
+        most: int,
+        affine: AffineBodies | None = None,
+    ):
         n, scalar = matrix.count, real.scalar
-        self.device, self.real, self.matrix = device, real, matrix
+        self.device, self.real, self.matrix, self.affine = device, real, matrix, affine
+        followers = [] if affine is None else affine.bodies
         self.modes = self.make_modes(free)
         self.tolerance, self.most = tolerance, most
         self.sums = shared.Sums(device, n)
@@ -59,6 +71,10 @@ class BlockPcg:
         self._r, self._u, self._w, self._p, self._s = (zeros(real.vec3) for _ in range(5))
         self._inverse = zeros(real.mat33)
         self._free = wp.array(free.astype(np.int32), device=device.warp)
+        unknown = free.copy()
+        for body in followers:
+            unknown[body.vertices] = False
+        self._unknown = wp.array(unknown.astype(np.int32), device=device.warp)
         self._numbers, self._partial = zeros(scalar, 3), zeros(scalar, self.sums.slots)
         self._first, self._residual = zeros(scalar, 1), zeros(scalar, 1)
         self.iterations, self._left, self._going = zeros(wp.int32, 1), zeros(wp.int32, 1), zeros(wp.int32, 1)
@@ -68,14 +84,18 @@ class BlockPcg:
         self._advance = _advance_kernel(real)
 
     def make_modes(self, free: np.ndarray) -> RigidModes:
-        return RigidModes(self.device, self.real, self.matrix, free)
+        bodies = [] if self.affine is None else self.affine.bodies
+        return RigidModes(self.device, self.real, self.matrix, free, bodies=bodies)
 
     def prepare(self, x: wp.array, couplings: list[Coupling]) -> None:
         """Launches the preconditioner for the matrix and couplings as they are now, at the positions x."""
         k = self._kernels
         diagonals = [c.diagonal for c in couplings if c.diagonal is not None]
-        diagonals += [None] * (2 - len(diagonals))
-        inputs = [self._free, self.matrix.diagonal, *diagonals, self._inverse]
+        if self.affine is not None:
+            self.affine.fold_diagonal([self.matrix.diagonal, *diagonals])
+            diagonals.append(self.affine.diagonal)
+        diagonals += [None] * (3 - len(diagonals))
+        inputs = [self._unknown, self.matrix.diagonal, *diagonals, self._inverse]
         self.device.launch(k.invert_diagonal, self.matrix.count, inputs, grain=32)
         if self.modes.groups:
             self.modes.prepare(x, couplings)
@@ -99,24 +119,34 @@ class BlockPcg:
         status = [self._first, self._left, self.iterations, self._residual, self._going]
         limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
         self.device.launch(k.clear, m.count, [self._w])
+        if self.affine is not None:
+            self.affine.expand(p)
         for c in couplings:
             c.apply(p, self._w)
         self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
+        if self.affine is not None:
+            self.affine.fold(self._r)
         self._precondition()
         sums.conclude(
             k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite]
         )
 
         def iterate() -> None:
+            if self.affine is not None:
+                self.affine.expand(self._u)
             for c in couplings:
                 c.apply(self._u, self._w)
             sums.launch(k.multiply, [*rows, self._free, self._u, self._w, self._partial])
+            if self.affine is not None:
+                self.affine.fold(self._w)
             sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])
             sums.launch(self._advance, [self._numbers, 1, self._w, self._u, self._p, self._s, p, self._r])
             self._precondition()
             sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits[1:], *status])
 
         self.device.loop(self._going, iterate)
+        if self.affine is not None:
+            self.affine.expand(p)
 
     def clear(self, values: wp.array) -> None:
         """Launches values = 0 over the vertices."""
@@ -169,6 +199,7 @@ def kernels(real: Real) -> SimpleNamespace:
         elastic: wp.array(dtype=mat33),
         contact_a: wp.array(dtype=mat33),
         contact_b: wp.array(dtype=mat33),
+        contact_c: wp.array(dtype=mat33),
         inverse_out: wp.array(dtype=mat33),
     ):
         i = first + wp.tid()
@@ -178,6 +209,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += contact_a[i]
             if contact_b:
                 total += contact_b[i]
+            if contact_c:
+                total += contact_c[i]
             inverse_out[i] = f.invert(total)
 
     @wp.kernel(module=module)

@@ -12,6 +12,7 @@ vectors a and b, (a + b)(a + b)^T <= 2 a a^T + 2 b b^T.
 """
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.sparse import csgraph
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import partition
+from pdipc.linear.affine import Follower
 from pdipc.linear.blocks import BlockMatrix
 
 GROUP = 64  # vertices of a group
@@ -87,15 +89,31 @@ _SOLVE = """
 class RigidModes:
     """label: (n,) each vertex's group, -1 where not free. arms: (n,) position in the group from its centre over its radius, so that the
     motion (t, r) of a group moves vertex i by t + r x arm_i. z: (groups,) the six numbers of each group. layout: what kernels over the groups
-    that add to c take first.
+    that add to c take first. bodies: those that move as four points do.
     """
 
-    def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, group: int | None = None):
+    wide = False  # how the work is cut: see `wide_modes`
+
+    def __init__(
+        self,
+        device: Device,
+        real: Real,
+        matrix: BlockMatrix,
+        free: np.ndarray,
+        group: int | None = None,
+        bodies: Sequence[Follower] = (),
+    ):
         self.device, self.real, self.matrix = device, real, matrix
+        free = free.copy()
+        for body in bodies:  # each a group of its own
+            free[body.vertices] = free[body.handles] = False
         total = int(free.sum())
         pattern = matrix.pattern + sp.eye_array(matrix.count)
         label = partition.groups(sp.csr_matrix(pattern), free, group or max(GROUP, total // MOST))
         self.groups = int(label.max(initial=-1)) + 1
+        for body in bodies:
+            label[body.vertices] = label[body.handles] = self.groups
+            self.groups += 1
         inside = np.flatnonzero(label >= 0)
         z = sp.csr_matrix((np.ones(len(inside)), (inside, label[inside])), shape=(matrix.count, max(1, self.groups)))
         coarse = sp.csr_matrix(z.T @ pattern @ z)

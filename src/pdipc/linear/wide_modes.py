@@ -33,6 +33,8 @@ class WideModes(RigidModes):
     contact connects two groups.
     """
 
+    wide = True
+
     def __init__(self, device: Device, real: Real, matrix: BlockMatrix, free: np.ndarray, group: int | None = None):
         super().__init__(device, real, matrix, free, group)
         starts, label = self.starts.numpy()[: self.groups + 1], self.label.numpy()[: matrix.count]

@@ -38,6 +38,7 @@ from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
+from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
@@ -643,7 +644,9 @@ class Newton:
         self.matrix = BlockMatrix(device, real, model.projector, held, free)
         equations = (device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
         operators = (exact.operator(real), friction.operator(real))
-        self.solver = WidePcg(*equations, operators) if device.wide else BlockPcg(*equations)
+        self.affine = AffineBodies(device, real, n, model.followers) if model.followers else None
+        wide = device.wide and self.affine is None
+        self.solver = WidePcg(*equations, operators) if wide else BlockPcg(*equations, self.affine)
         work.truncation.neighbours = [self.matrix.offsets, self.matrix.columns]
         simulated = [body for body in assembly.bodies if not body.kinematic]
         ranges = [(body.first, body.last) for body in simulated]
@@ -680,6 +683,8 @@ class Newton:
         def upload(values) -> wp.array:
             return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=device.warp)
 
+        # a body that follows four points turns as these do
+        ranges = [(body.handles[0], body.last) if len(body.handles) else (body.first, body.last) for body in simulated]
         self.starts, self.ends = upload([low for low, _ in ranges]), upload([high for _, high in ranges])
         self.whole = upload([free[low:high].all() for low, high in ranges])
         vec3, scalar = real.vec3, real.scalar
@@ -705,7 +710,8 @@ class Newton:
         self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
         self.largest = Reducer(device, real, n)
-        lightest = float(model.mass.numpy()[free].min()) if free.any() else 1.0
+        mass = model.mass.numpy()
+        lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
         self.iterations = self.solver.iterations
         self.inner = zeros(wp.int32, 1)  # no local-global iterations
@@ -795,6 +801,8 @@ class Newton:
         friction = None if self.friction is None else self.friction.force_of_vertex
         where = [w.u, w.x_start, w.script.target, model.free, w.script.mover, w.script.drive]
         device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        if self.affine is not None:
+            self.affine.fold(self.rhs)
         device.when(self.renew, self._assemble)
         self._solve_linear()
         device.when(self.solver.indefinite, self._solve_projected)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pdipc.scene import generators, meshes, pattern, rods, seams, sewing
+from pdipc.scene import generators, meshes, pattern, rigid, rods, seams, sewing
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.frames import Frames, read_frames, timed
 from pdipc.scene.garments import Inside
@@ -28,6 +28,8 @@ from pdipc.scene.schema import (
     Obstacle,
     Pin,
     Placed,
+    Rigid,
+    RigidMaterial,
     Rod,
     RodMaterial,
     Scene,
@@ -51,7 +53,8 @@ class AssembledBody:
 
     tets: (t, 4) int32 and triangles: (m, 3) int32, indices into all vertices; a solid's triangles are its boundary, outward; a rod's
     are its segments (a, b, b). joints: (j, 2) int32, segments of a rod that follow each other. ghosts: (s,) int32, the points that mark
-    how its segments are twisted, the last of its vertices; none where it twists freely.
+    how its segments are twisted, the last of its vertices; none where it twists freely. handles: (4,) int32, the points that a rigid body
+    moves as, the last of its vertices, weights (k, 4) of these for the others, and its volume, m^3.
     material: None for an obstacle. half_separation: its part of a pair's minimum separation, m. friction: coefficient.
     trajectory: how an obstacle moves; None for bodies. inside: what a closed cloth holds. pattern: (m, 3, 3) m, the corners of each
     triangle of a cloth that is cut from flat panels, as they are there.
@@ -59,12 +62,12 @@ class AssembledBody:
     """
 
     name: str
-    kind: Literal["solid", "cloth", "rod", "obstacle"]
+    kind: Literal["solid", "cloth", "rod", "rigid", "obstacle"]
     first: int
     last: int
     tets: np.ndarray
     triangles: np.ndarray
-    material: SolidMaterial | ClothMaterial | RodMaterial | None
+    material: SolidMaterial | ClothMaterial | RodMaterial | RigidMaterial | None
     half_separation: float
     friction: float
     trajectory: Trajectory | Deforming | None = None
@@ -73,6 +76,9 @@ class AssembledBody:
     orientation: np.ndarray = field(default_factory=lambda: np.eye(3))
     joints: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int32))
     ghosts: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    handles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    volume: float = 0.0
     pattern: np.ndarray | None = None
 
     @property
@@ -90,7 +96,7 @@ class AssembledBody:
     @property
     def count(self) -> int:
         """Vertices of its mesh: those that a scene can name."""
-        return self.last - self.first - len(self.ghosts)
+        return self.last - self.first - len(self.ghosts) - len(self.handles)
 
     @property
     def segments(self) -> np.ndarray:
@@ -343,7 +349,26 @@ def load_mesh(placed: Placed, worker: Worker | None = None) -> tuple[Mesh, np.nd
         mesh = meshes.tetrahedralize(mesh, where)
     if isinstance(placed, Obstacle):
         mesh = meshes.without_useless(mesh, where)
+    if isinstance(placed, Rigid):
+        _solid_inside(mesh, start, where)
     return mesh, mesh.vertices if start is None else start
+
+
+def _solid_inside(mesh: Mesh, start: np.ndarray | None, where: str) -> None:
+    """Raises SceneError where the surface of a rigid body has no inside, or starts in another shape."""
+    if start is not None and not np.array_equal(start, mesh.vertices):
+        raise SceneError(f"{where}: a rigid body keeps its shape; leave out start, and place it")
+    if not meshes.is_closed(mesh.triangles):
+        sides = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        rim = int(np.count_nonzero(np.unique(sides, axis=0, return_counts=True)[1] == 1))
+        found = f"{rim} edges of its surface belong to one triangle only" if rim else "its triangles face both ways"
+        raise SceneError(f"{where}: {found}; the surface of a rigid body must be closed, and face outward")
+    if not np.isfinite(mesh.vertices).all():
+        return  # the check says so
+    volume = rigid.inertia(mesh.vertices, mesh.triangles).volume
+    size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    if not volume > meshes.FLAT * size**3:
+        raise SceneError(f"{where}: its surface holds {volume:.4g} m^3; it must face outward around an inside")
 
 
 def load_deforming(placed: Obstacle, deformation: Deformation, worker: Worker | None = None) -> tuple[Mesh, Frames]:
@@ -468,6 +493,13 @@ def gather(
         if isinstance(placed, Cloth) and (placed.weld or placed.open_seams):
             with _noting(problems):
                 mesh, rest, start, cut = _seamed(placed, mesh, rest, start, cut, notes)
+        solid = None
+        if isinstance(placed, Rigid):
+            solid = rigid.inertia(rest, mesh.triangles)
+            center = solid.center
+            rest = np.concatenate([rest, solid.handles()])
+            start = rest
+        count = len(rest)
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
@@ -486,6 +518,9 @@ def gather(
                 joints=mesh.joints,
                 ghosts=ghosts + first,
                 pattern=cut,
+                handles=np.arange(first + count - 4, first + count, dtype=np.int32) if solid else ghosts[:0],
+                weights=solid.weights(rest[:-4]) if solid else np.zeros((0, 4)),
+                volume=solid.volume if solid else 0.0,
             )
             velocities = np.zeros_like(rest)
             if isinstance(placed, Body):
@@ -753,10 +788,15 @@ def _seam(assembly: Assembly, body: AssembledBody) -> np.ndarray:
 def _force(assembly: Assembly, table: Wind | VertexForce, where: str) -> None:
     end = np.inf if table.end is None else table.end
     if isinstance(table, Wind):
-        names = [body.name for body in assembly.bodies if not body.kinematic] if table.bodies is None else table.bodies
+        felt = [body.name for body in assembly.bodies if body.kind in ("solid", "cloth")]
+        names = felt if table.bodies is None else table.bodies
+        other = [name for name in names if _body(assembly, name, where).kind in ("rod", "rigid")]
+        if other:
+            raise SceneError(f'{where}: wind does not blow on rods and rigid bodies, such as "{other[0]}"; leave it out')
         if len(set(names)) < len(names):
             raise SceneError(f"{where}: names a body more than once: {', '.join(names)}")
-        triangles = np.concatenate([_pushed(assembly, name, where).triangles for name in names])
+        none = np.zeros((0, 3), dtype=np.int32)
+        triangles = np.concatenate([none, *(_pushed(assembly, name, where).triangles for name in names)])
         wind = AssembledWind(triangles, np.array(table.velocity), table.air_density, table.drag, table.start, end)
         assembly.winds.append(wind)
     else:

@@ -19,7 +19,7 @@ from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import MOST, most_chords, movers_of
 from pdipc.scene.quarantine import Quarantine
-from pdipc.scene.schema import Cloth, Rod, Scene, local_global_settings, uses_newton
+from pdipc.scene.schema import Cloth, Rigid, Rod, Scene, local_global_settings, uses_newton
 from pdipc.scene.separate import separate
 
 LISTED = 5  # vertices that a finding names
@@ -137,6 +137,18 @@ def _settings(scene: Scene) -> Iterator[Finding]:
         yield Finding("simulation.nonlinear_solver", found, "leave it out")
     newton = method != "paper" and uses_newton(sim)
     for body in scene.bodies:
+        if isinstance(body, Rigid):
+            if not newton:
+                found = (
+                    "is rigid, which the paper's contact does not know"
+                    if method == "paper"
+                    else "is rigid: its parts move as one"
+                )
+                yield Finding(f'body "{body.name}"', found, 'take the Newton solver, and contact.method = "barrier"')
+            for number, pin in enumerate(body.pins):
+                if pin.stiffness is None:
+                    right = "give it a stiffness, or make the body an obstacle"
+                    yield Finding(f'body "{body.name}", pins[{number}]', "holds vertices of a rigid body exactly", right)
         if isinstance(body, Rod) and method == "paper":
             yield Finding(
                 f'body "{body.name}"', "is a rod, which the paper's contact does not know", 'take contact.method = "barrier"'
@@ -285,7 +297,7 @@ def _elements(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
         yield Finding(
             label, found, "the surface must be a manifold: give each fan a vertex of its own, with a gap between them"
         )
-    unused = np.setdiff1d(np.arange(first, body.last), elements)
+    unused = np.setdiff1d(np.arange(first, first + body.count), elements)
     if len(unused):
         found = f"{len(unused)} vertices belong to no {kind[:-1]}, first vertex {unused[0] - first}"
         yield Finding(label, found, "remove them")

@@ -40,7 +40,7 @@ def _line(problem: Any, data: Any, model: type[BaseModel]) -> tuple[str, str, st
 
 
 def _kinds(keys: list[str | int]) -> str:
-    return '"solid", "cloth" or "rod"' if "bodies" in keys[:1] else '"wind" or "vertices"'
+    return '"solid", "cloth", "rod" or "rigid"' if "bodies" in keys[:1] else '"wind" or "vertices"'
 
 
 def _about(keys: list[str | int], models: list[type[BaseModel]]) -> str:

@@ -25,6 +25,8 @@ SECTIONS = {
         garments.Inside,
         schema.Rod,
         schema.RodMaterial,
+        schema.Rigid,
+        schema.RigidMaterial,
         schema.Copies,
     ),
     "Pins, selections, attachments, stitches": (schema.Pin, schema.Selection, schema.Attachment, schema.Stitch),

@@ -689,7 +689,7 @@ class Copies(Table):
 
 
 class Body(Placed):
-    """What solids, cloth and rods share."""
+    """What solids, cloth, rods and rigid bodies share."""
 
     velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, m/s.")
     angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="At the start, about the centre of mass, rad/s.")
@@ -759,6 +759,27 @@ class Rod(Body):
         default=None,
         description="Gap kept between the center lines of copies of this body, m; two bodies keep the mean. Absent: twice the radius.",
     )
+
+
+class RigidMaterial(Table):
+    """What keeps its shape."""
+
+    density: Positive = Field(default=1000.0, le=1e5, description="Mass per volume, kg/m^3.")
+    shape_stiffness: Positive = Field(
+        default=1e9,
+        le=1e13,
+        description="Young's modulus, Pa, of what keeps the shape: a pressure p over the body strains it by about p over this.",
+    )
+
+
+class Rigid(Body):
+    """A body that keeps its shape, whatever its mesh: twelve unknowns. Its surface must be closed; a mesh of tets gives its own.
+
+    It has an inside of uniform density. Pins need a stiffness: what is to be held exactly is an obstacle.
+    """
+
+    kind: Literal["rigid"] = "rigid"
+    material: RigidMaterial = Field(default_factory=RigidMaterial, description="What it is made of.")
 
 
 def _cache_kind(value: Any) -> str | None:
@@ -867,7 +888,7 @@ class Scene(Table):
     description: str = Field(default="", description="What it shows.")
     simulation: Simulation = Field(default_factory=Simulation, description="How time advances.")
     contact: Contact = Field(default_factory=Contact, description="How surfaces keep apart.")
-    bodies: list[Annotated[Solid | Cloth | Rod, Field(discriminator="kind")]] = Field(
+    bodies: list[Annotated[Solid | Cloth | Rod | Rigid, Field(discriminator="kind")]] = Field(
         min_length=1, description="What is simulated."
     )
     obstacles: list[Obstacle] = Field(default=[], description="Rigid surfaces, static or scripted.")

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from pdipc.judge import boxes
 from pdipc.judge.witness import edge_triangle_crossings, find_intersections
+from pdipc.scene import rods
 from pdipc.scene.assembly import Assembly
 from pdipc.scene.distances import closest_on_segments, closest_on_triangles, encloses, winding_numbers
 
@@ -71,11 +72,12 @@ class _Separator:
         sides = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         self.edges = np.unique(sides[sides[:, 0] != sides[:, 1]], axis=0)  # a rod's segment is a triangle (a, b, b)
         self.owner, self.obstacle, held = assembly.body_of_vertex, assembly.obstacle, assembly.scripted
-        solid = np.array([body.kind == "solid" for body in assembly.bodies])
+        rigid = np.array([body.kind == "rigid" for body in assembly.bodies])
+        solid = rigid | np.array([body.kind == "solid" for body in assembly.bodies])
         self.weight = np.where(held, 0.0, np.where(solid[self.owner], SOLID_WEIGHT, 1.0))
         # solids that nothing holds move as a whole
         loose = solid & (np.bincount(self.owner, held, minlength=len(solid)) == 0)
-        self.rigid = loose[self.owner]
+        self.rigid, self.stiff = loose[self.owner], rigid[self.owner]
         self.half = np.array([body.half_separation for body in assembly.bodies])[self.owner]
         self.gap = GAP * assembly.activation_distance
         self.encloses = [encloses(assembly.positions, body.triangles) for body in assembly.bodies]
@@ -107,6 +109,11 @@ class _Separator:
 
     def _result(self, first: int) -> Separation:
         bodies = self.assembly.bodies
+        for body in bodies:
+            if len(body.ghosts):  # which follow their rods
+                own = slice(body.first, body.first + body.count)
+                rest, radius = self.assembly.rest_positions[own], body.material.radius  # pyright: ignore
+                self.x[body.ghosts] = rods.ghost_points(rest, self.x[own], body.segments - body.first, body.joints, radius)[1]
         pairs = find_intersections(self.x, self.triangles, self.obstacle)
         left = np.unique(np.sort(self.owner[self.triangles[pairs][:, :, 0]], axis=1), axis=0)
         far = np.linalg.norm(self.x - self.assembly.positions, axis=1)
@@ -263,7 +270,7 @@ class _Separator:
         free = total > 0.0
         quads, weights, directions, ways, total = (each[free] for each in (quads, weights, directions, ways, total))
         own = (weights * self.weight[quads] * (ways / total)[:, None])[:, :, None] * directions[:, None, :]
-        as_whole = self.rigid & rigid
+        as_whole = self.rigid & rigid | self.stiff
         if as_whole.any():
             # a body gives way as readily as its vertices do
             side = np.where(self.owner[quads] == self.owner[quads[:, :1]], 0, 1)

@@ -45,6 +45,8 @@ class Grip:
         radius = max(GRIP * np.linalg.norm(np.ptp(x[own.first : own.last], axis=0)), np.sort(away)[:HELD][-1])
         vertices = choice[away <= radius]
         mass, h = model.mass.numpy().astype(np.float64), model.settings.time_step
+        for each in model.followers:  # whose mass is at four points: here it is spread
+            mass[each.all] = mass[each.handles].sum() / len(each.all)
         shares = np.zeros(model.vertex_count)
         shares[vertices] = mass[vertices] / mass[vertices].sum()
         sets, _ = elasticity(model.assembly)  # the constant matrix of projective dynamics, whatever solves the step

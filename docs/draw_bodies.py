@@ -1,4 +1,4 @@
-"""Runs the scenes with rods and draws their pictures: `python docs/draw_rods.py [-o FOLDER]`. Takes a minute."""
+"""Runs the scenes of rods and rigid bodies and draws their pictures: `python docs/draw_bodies.py [-o FOLDER] [NAME ...]`. Takes minutes."""
 
 import argparse
 import tempfile
@@ -59,8 +59,76 @@ def ladder() -> pdipc.Scene:
     )
 
 
+def chain() -> pdipc.Scene:
+    """A chain of steel rings that falls taut between a held ring and a heavy ball."""
+    torus = {"shape": "torus", "major_radius": 0.05, "minor_radius": 0.01, "cells": (4, 20)}
+    steel = {"density": 7800.0, "shape_stiffness": 1e10}
+    bodies = []
+    for k in range(6):
+        turned = (90, 90 * ((k + 1) % 2), 0)
+        body = {"name": f"ring{k}", "kind": "rigid", "mesh": torus, "material": steel, "rotation": turned}
+        bodies.append({**body, "translation": (0.065 * (k + 1), 0, 0), "rotation": (90 * (k % 2), 0, 0)})
+    swing = {"keyframes": [{"time": 0}, {"time": 0.4, "translation": (0, 0.05, 0)}], "smooth": True}
+    held = {"name": "held", "mesh": torus, "motion": swing, "rotation": (90, 0, 0)}
+    post = {
+        "name": "post",
+        "mesh": {"shape": "cylinder", "radius": 0.04, "length": 0.4, "cells": (10, 4)},
+        "rotation": (90, 0, 0),
+    }
+    post["translation"] = (0.1, -0.28, 0)
+    simulation = {"time_step": 0.005, "steps": 110, "damping": 0.5}
+    return pdipc.Scene(bodies=bodies, obstacles=[held, post], simulation=simulation, contact={"friction": 0.2})
+
+
+def everything() -> pdipc.Scene:
+    """A cloth, a solid, ropes and rigid bodies fall on each other over a ball."""
+    ball = {"name": "ball", "mesh": {"shape": "sphere", "radius": 0.15, "cells": 12}}
+    sheet = {
+        "name": "sheet",
+        "kind": "cloth",
+        "mesh": {"shape": "grid", "size": (0.6, 0.6), "cells": (24, 24)},
+        "translation": (0, 0.18, 0),
+    }
+    bodies: list = [{**sheet, "minimum_separation": 1e-3}]
+    soft = {"shape": "box", "size": (0.12, 0.08, 0.12), "cells": (4, 3, 4)}
+    bodies.append(
+        {"name": "soft", "kind": "solid", "mesh": soft, "translation": (0.03, 0.26, 0), "material": {"young_modulus": 5e4}}
+    )
+    for k, (x, z, turn) in enumerate([(0.0, 0.02, 20.0), (0.02, -0.03, -30.0)]):
+        rope = {
+            "name": f"rope{k}",
+            "kind": "rod",
+            "mesh": {"shape": "rope", "length": 0.5, "segments": 40},
+            "rotation": (0, turn, 0),
+        }
+        material = {"radius": 6e-3, "stretch_stiffness": 2e3, "bending_stiffness": 1e-4, "twist_stiffness": 1e-4}
+        bodies.append({**rope, "translation": (x, 0.32 + 0.02 * k, z), "material": material})
+    steel = {"density": 3000.0}
+    cube = {"shape": "box", "size": (0.06, 0.06, 0.06), "cells": (1, 1, 1)}
+    bodies.append(
+        {
+            "name": "cube",
+            "kind": "rigid",
+            "mesh": cube,
+            "translation": (0.0, 0.42, 0.0),
+            "rotation": (30, 0, 40),
+            "material": steel,
+        }
+    )
+    ring = {"shape": "torus", "major_radius": 0.05, "minor_radius": 0.015, "cells": (6, 24)}
+    bodies.append({"name": "ring", "kind": "rigid", "mesh": ring, "translation": (-0.05, 0.5, 0.03), "material": steel})
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 4.0}, "translation": (0, -0.15, 0)}
+    simulation = {"time_step": 0.01, "steps": 90}
+    return pdipc.Scene(bodies=bodies, obstacles=[ball, floor], simulation=simulation, contact={"friction": 0.4})
+
+
 # Which frames, from which side.
-PICTURES = {"knot": (knot, (0, 70, 110), (0.1, 0.3, 1.0)), "rope_ladder": (ladder, (0, 80, 130), (0.9, 0.25, 0.8))}
+PICTURES = {
+    "knot": (knot, (0, 70, 110), (0.1, 0.3, 1.0)),
+    "rope_ladder": (ladder, (0, 80, 130), (0.9, 0.25, 0.8)),
+    "chain": (chain, (0, 45, 110), (0.3, 0.2, 1.0)),
+    "all_kinds": (everything, (0, 30, 90), (0.7, 0.4, 1.0)),
+}
 
 
 def _cropped(image: np.ndarray) -> np.ndarray:
