@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import pdipc
-from pdipc.output.render import render
+from pdipc.output.render import Picture, render
 
 matplotlib.use("Agg")
 
@@ -77,7 +77,7 @@ def chain() -> pdipc.Scene:
     }
     post["translation"] = (0.1, -0.28, 0)
     simulation = {"time_step": 0.005, "steps": 110, "damping": 0.5}
-    return pdipc.Scene(bodies=bodies, obstacles=[held, post], simulation=simulation, contact={"friction": 0.2})
+    return pdipc.Scene(bodies=bodies, obstacles=[held, post], simulation=simulation, contact={"friction": 0.2, "activation_distance": 5e-4})
 
 
 def everything() -> pdipc.Scene:
@@ -146,10 +146,10 @@ def main() -> None:
         made, frames, view = PICTURES[name]
         figure, axes = plt.subplots(1, len(frames), figsize=(6.4 * len(frames), 4.8), layout="constrained")
         with tempfile.TemporaryDirectory() as folder:
-            pdipc.run_scene(made(), f"{folder}/run", device="cpu", certify=True)
+            pdipc.run_scene(made(), f"{folder}/run", device="cpu")
             run = pdipc.open_run(f"{folder}/run")
             for frame, axis in zip(frames, axes, strict=True):
-                render(run, frame, f"{folder}/{frame}.png", size=(960, 720), view=view)
+                render(run, frame, f"{folder}/{frame}.png", Picture(size=(960, 720), view=view))
                 axis.imshow(_cropped(plt.imread(f"{folder}/{frame}.png")))
                 axis.set(xticks=[], yticks=[], frame_on=False)
             met = sum(
