@@ -77,7 +77,9 @@ def chain() -> pdipc.Scene:
     }
     post["translation"] = (0.1, -0.28, 0)
     simulation = {"time_step": 0.005, "steps": 110, "damping": 0.5}
-    return pdipc.Scene(bodies=bodies, obstacles=[held, post], simulation=simulation, contact={"friction": 0.2, "activation_distance": 5e-4})
+    return pdipc.Scene(
+        bodies=bodies, obstacles=[held, post], simulation=simulation, contact={"friction": 0.2, "activation_distance": 5e-4}
+    )
 
 
 def everything() -> pdipc.Scene:
