@@ -19,6 +19,7 @@ from pdipc.constraints import (
     woven,
 )
 from pdipc.scene.assembly import AssembledBody, Assembly
+from pdipc.scene.check_garments import WARP
 from pdipc.scene.schema import ClothMaterial
 
 
@@ -38,7 +39,7 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
             law = material.woven(
                 m.membrane_stiffness, m.weft_stiffness or m.membrane_stiffness, m.shear_stiffness, m.poisson_ratio
             )
-            sets.append(woven.rest(rest, corners, law, m.warp or (1.0, 0.0, 0.0)))
+            sets.append(woven.rest(rest, corners, law, m.warp or WARP))
             area = 0.0
         else:
             sets.append(triangle_strain.rest(rest, corners, strain))

@@ -185,3 +185,12 @@ def test_what_needs_newton_says_so():
         scene([strip_table(material={"weft_stiffness": 10.0, "membrane": "springs"})])
     with pytest.raises(pdipc.SceneError, match="warp must be a direction"):
         scene([strip_table(material={"warp": (1, 0, 0)})])
+
+
+def test_a_warp_across_triangles_is_refused():
+    box = {"shape": "box", "size": [0.2, 0.1, 0.2], "cells": [2, 1, 2]}
+    body = {"name": "bag", "kind": "cloth", "mesh": box, "material": {"weft_stiffness": 10.0}}
+    (found,) = pdipc.check_scene(scene([body]))
+    assert str(found).startswith('body "bag": material.warp: [1.0, 0.0, 0.0] is across 8 of 32 triangles')
+    body["material"]["warp"] = (1.0, 0.5, 0.3)
+    assert pdipc.check_scene(scene([body])) == []

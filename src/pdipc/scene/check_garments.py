@@ -9,6 +9,7 @@ from pdipc.scene.assembly import AssembledBody, Assembly
 from pdipc.scene.finding import Finding
 from pdipc.scene.schema import Cloth, ClothMaterial
 
+WARP = (1.0, 0.0, 0.0)  # the default
 MOST_STRETCH = 5.0  # of a triangle at the start: more is no shape of its pattern
 
 
@@ -19,6 +20,7 @@ def check_garments(assembly: Assembly) -> Iterator[Finding]:
             yield Finding(stitch.where, "sews no vertex", 'raise "within", or give pairs')
     for body in assembly.bodies:
         yield from _stretched(assembly, body)
+        yield from _across(assembly, body)
         if body.inside is not None:
             yield from _closed(body)
 
@@ -79,6 +81,22 @@ def _stretched(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     elif m.strain_limit is not None and most[worst] - 1.0 > m.strain_limit:
         found = f"is {m.strain_limit:g}, but triangles[{worst}] starts stretched by {most[worst] - 1.0:.3g}"
         yield Finding(f"{where}: material.strain_limit", found, "raise it, or start nearer to the rest shape")
+
+
+def _across(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
+    """Woven cloth with triangles that have no direction of warp."""
+    m = body.material
+    if not isinstance(m, ClothMaterial) or not m.is_woven:
+        return
+    shape = body.elastic_shape
+    corners = assembly.rest_positions[body.triangles] if shape is None else shape[0].reshape(-1, 3, 3)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    warp = np.array(m.warp or WARP)
+    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(warp)
+    bad = np.flatnonzero(np.linalg.norm(np.cross(normal, warp), axis=1) < 2e-3 * size)
+    if len(bad):
+        found = f"{warp.tolist()} is across {len(bad)} of {len(corners)} triangles, first triangles[{bad[0]}]"
+        yield Finding(f'body "{body.name}": material.warp', found, "give another direction, or a flat pattern as `rest`")
 
 
 def _closed(body: AssembledBody) -> Iterator[Finding]:
