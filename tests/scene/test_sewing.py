@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from physics.scenes import cloth, scene
+from physics.scenes import cloth, rod, scene
 
 import pdipc
 from pdipc.scene import sewing
@@ -98,3 +98,14 @@ def test_one_body_of_two_panels_is_sewn_to_itself():
     assert len(stitch.elements) == 6
     assert all((element[0] < 3) == (element[1:] >= 3).all() for element in stitch.elements)
     np.testing.assert_allclose(stitch.distances, 0.1)
+
+
+def test_a_rod_is_sewn_to_a_cloth_and_not_the_other_way():
+    made = scene([cloth("sheet", (1.0, 1.0), (4, 4)), rod("rope", 0.5, 5, at=(0, 0.02, 0))])
+    made.stitches = [{"bodies": ["rope", "sheet"], "within": 0.03, "onto": "surface"}]
+    (stitch,) = assemble(made).stitches
+    assert len(stitch.elements) == 6
+    np.testing.assert_allclose(stitch.distances, 0.02, atol=1e-12)
+    made.stitches = [{"bodies": ["sheet", "rope"], "within": 0.03}]
+    with pytest.raises(pdipc.SceneError, match='body "rope" has no triangles to sew to'):
+        assemble(made)

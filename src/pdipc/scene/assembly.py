@@ -712,13 +712,18 @@ def _stitch(assembly: Assembly, table: Stitch, where: str) -> None:
     a, b = (_body(assembly, name, where) for name in table.bodies)
     if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
         return  # the check says so
+    if b.kind == "rod":
+        raise SceneError(f"{where}: {_label(b)} has no triangles to sew to; name the rod first, or take an attachment")
     if table.within is None:
         listed = table.points if table.points is not None else [(v, [w], [1.0]) for v, w in table.pairs or []]
         _in_range(a, [vertex for vertex, _, _ in listed], where)
         _in_range(b, [vertex for _, corners, _ in listed for vertex in corners], where)
         elements, weights = sewing.named(b, [(v + a.first, [c + b.first for c in on], w) for v, on, w in listed], where)
     else:
-        chosen = sewing.rim_vertices(a.triangles) if table.select is None else _select(assembly, a, table.select, where)
+        if table.select is not None:
+            chosen = _select(assembly, a, table.select, where)
+        else:  # a rod has no rim
+            chosen = np.unique(a.triangles) if a.kind == "rod" else sewing.rim_vertices(a.triangles)
         elements, weights = sewing.nearest(assembly.positions, a, b, chosen, table.within, table.onto == "surface")
     x = assembly.positions[elements]
     distances = np.linalg.norm(np.einsum("ek,ekd->ed", weights, x[:, 1:]) - x[:, 0], axis=1)
