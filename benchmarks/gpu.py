@@ -36,6 +36,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(REPOSITORY / folder) for folder in ("src", ".", "benchmarks", "tests/collision")]
 
 import gpu_checks as checks  # noqa: E402
+import gpu_predict as predict  # noqa: E402
 import gpu_times as times  # noqa: E402
 
 from pdipc.device.launch import Device  # noqa: E402
@@ -205,7 +206,11 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--cases", type=json.loads, help=argparse.SUPPRESS)
+    parser.add_argument("--predict", action="store_true", help="what the peers' scenes should take, without a GPU")
     options = parser.parse_args(arguments)
+    if options.predict:
+        predict.print_table()
+        return 0
     if options.prepare:
         checks.prepare(options.prepare, options.arch, options.small, options.case)
         return 0

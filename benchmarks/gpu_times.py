@@ -204,7 +204,7 @@ def profile(report, place: Device, case: str, carried: Path | None) -> None:
         report.add(skipped="only CUDA times kernels")
         return
     simulation = pdipc.Simulation(peer_scenes.scene(case), place.name)
-    while simulation.steps_done < 30 and report.left() > 15:
+    while simulation.steps_done < 60 and report.left() > 8:
         simulation.step()
     work, state = Work(simulation.model, recorded=False), simulation.state
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
