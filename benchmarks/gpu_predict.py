@@ -32,13 +32,13 @@ MEASURED = Path(__file__).parent / "results" / "gpu.json"
 
 
 class Tracer(Device):
-    """Runs nothing. loops: by the condition of the loop or branch that they are in, the launches and the bytes of one turn."""
+    """Runs nothing. launches: by the conditions of the loops and branches that they are in, bytes of each launch of one turn."""
 
     def __init__(self):
         super().__init__("cpu", threads=1)
         self.wide, self.block = True, CUDA_BLOCK
-        self.launches: dict[int, list[int]] = defaultdict(list)
-        self._inside = 0
+        self.launches: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        self._inside: tuple[int, ...] = ()
 
     def _note(self, inputs: Sequence[Any]) -> None:
         arrays = {each.ptr: each.size * wp.types.type_size_in_bytes(each.dtype) for each in _arrays(inputs)}
@@ -65,7 +65,7 @@ class Tracer(Device):
         self._note([])
 
     def loop(self, condition: wp.array, body: Callable[[], None]) -> None:
-        before, self._inside = self._inside, condition.ptr
+        before, self._inside = self._inside, (*self._inside, condition.ptr)
         body()
         self._inside = before
 
@@ -109,21 +109,26 @@ def predict(name: str, row: dict) -> dict:
         work.method.grow()
     place.launches.clear()
     algorithm.time_step(work)
-    method, outer = work.method, row["outer"]
-    turns = defaultdict(float, {0: 1.0, work.going.ptr: outer, method.renew.ptr: outer})
-    turns[method.solver._going.ptr] = row["linear_iterations"] / ITERATIONS
-    turns[work.truncation.going.ptr] = outer + row["truncations"]
-    turns[work.truncation.any_hit.ptr] = row["truncations"]
-    turns[work.candidates.needed.ptr] = 1.0  # a list lasts for about a step
-    launches = sum(turns[key] * len(noted) for key, noted in place.launches.items())
-    moved = sum(turns[key] * sum(noted) for key, noted in place.launches.items())
+    method, outer, going = work.method, row["outer"], work.going.ptr
+    conjugate = (going, method.solver._going.ptr)
+    turns = {
+        (): 1.0,
+        (going,): outer,
+        (going, method.renew.ptr): outer,
+        conjugate: row["linear_iterations"] / ITERATIONS,
+        (going, work.truncation.going.ptr): outer + row["truncations"],
+        (going, work.truncation.going.ptr, work.truncation.any_hit.ptr): row["truncations"],
+        (going, work.candidates.needed.ptr): 1.0,  # a list lasts for about a step
+    }
+    launches = sum(number * len(place.launches[key]) for key, number in turns.items())
+    moved = sum(number * sum(place.launches[key]) for key, number in turns.items())
     waits = launches * LAUNCH + sum(turns.values()) * LOOP_TURN
     memory = memory_of(work)
     return {
         "scene": name,
         "DOF": 3 * model.vertex_count,
         "launches": launches,
-        "an iteration": len(place.launches[method.solver._going.ptr]) / ITERATIONS,
+        "an iteration": len(place.launches[conjugate]) / ITERATIONS,
         "GB": moved / 1e9,
         "waits ms": 1e3 * waits,
         **{machine: 1e3 * (waits + moved / speed) for machine, speed in MACHINES.items()},
