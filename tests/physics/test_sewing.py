@@ -72,3 +72,29 @@ def test_threads_are_loose_before_they_are_sewn_and_hold_a_weight_after():
     length = np.linalg.norm(along, axis=1)
     pull = (20.0 * np.maximum(0.0, length - 0.01) * along[:, 1] / length).sum()
     assert pull == pytest.approx(0.2 * 0.01 * 9.81, rel=1e-3)
+
+
+def test_a_rigid_cube_hangs_from_a_sheet_by_its_threads():
+    """At rest the threads carry its weight, and its sides stay as long as they were."""
+    box = {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [1, 1, 1]}
+    cube = {"name": "cube", "kind": "rigid", "mesh": box, "translation": [0, 0.305, 0]}
+    corners = [{"select": {"nearest": [x, 0.36, z]}} for x in (-0.15, 0.15) for z in (-0.15, 0.15)]
+    stiff = {"membrane_stiffness": 2000.0, "areal_density": 0.2}
+    sheet = cloth("sheet", (0.3, 0.3), (6, 6), at=(0, 0.36, 0), pins=corners, material=stiff)
+    made = scene([sheet, cube], contact={"activation_distance": 1e-3}, time_step=0.2, damping=5.0)
+    made.stitches = [
+        {"bodies": ["sheet", "cube"], "within": 0.006, "onto": "surface", "select": {"all": True}, "length": 0.004}
+    ]
+    simulation = watched(made)
+    for _ in range(15):
+        result = simulation.step()
+        assert result.converged
+    (stitch,) = simulation.model.assembly.stitches
+    x = simulation.positions
+    along = np.einsum("ek,ekd->ed", stitch.weights, x[stitch.elements[:, 1:]]) - x[stitch.elements[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    pull = (2000.0 * np.maximum(0.0, length - 0.004) * along[:, 1] / length).sum()
+    assert len(length) == 9 and result.barriers == 0
+    assert -pull == pytest.approx(1.0 * 9.81, rel=2e-3)
+    sides = np.linalg.norm(x[49:][:, None] - x[49:], axis=2).max()
+    assert sides == pytest.approx(0.1 * np.sqrt(3), rel=1e-5)
