@@ -193,7 +193,8 @@ class Drawing:
         self.beside = legend.width(width, height) if field is not None else 0
         self.size = (width - self.beside, height)
         self.plotter = pyvista.Plotter(off_screen=True, window_size=list(JUDGED), lighting="none")
-        self.plotter.ren_win.SetMultiSamples(0)
+        self.window: Any = self.plotter.ren_win
+        self.window.SetMultiSamples(0)
         self.plotter.renderer.SetUseOIT(False)  # passes over the whole picture, for what alike grey obstacles do not need
         seen = self._framed(frames)
         low, high = seen.min(axis=0), seen.max(axis=0)
@@ -375,7 +376,7 @@ class Drawing:
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkCommonCore import vtkFloatArray, vtkUnsignedCharArray
 
-        window = self.plotter.ren_win
+        window = self.window
         window.Render()
         width, height = (int(part * side) for side in window.GetSize())
         colors, depths = vtkUnsignedCharArray(), vtkFloatArray()
