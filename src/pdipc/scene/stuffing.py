@@ -82,8 +82,8 @@ def _crossings(level: LevelSet, points: np.ndarray, value: np.ndarray, edges: np
 def _snapped(
     points: np.ndarray, value: np.ndarray, edges: np.ndarray, at: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The lattice with every point that is too near to a crossing moved onto its nearest one, its value there 0; and which edges
-    are still crossed.
+    """The lattice with every point that is too near to a crossing moved onto its nearest one, its value there 0; and the numbers of
+    the edges that are still crossed.
     """
     points, value = points.copy(), value.copy()
     length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
@@ -95,7 +95,7 @@ def _snapped(
     close = close[np.argsort((part * np.tile(length, 2))[close], kind="stable")]
     moved, first = np.unique(ends[close], return_index=True)
     points[moved], value[moved] = place[close[first]], 0.0
-    return points, value, ~np.isin(edges, moved).any(axis=1)
+    return points, value, np.flatnonzero(~np.isin(edges, moved).any(axis=1))
 
 
 def _cut(points: np.ndarray, sign: np.ndarray, tets: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -162,7 +162,7 @@ def _pinched(tets: np.ndarray) -> np.ndarray:
         if len(around):
             piece = _pieces(tets[around])
             out[around[piece != np.bincount(piece).argmax()]] = True
-    return out if out.any() else np.isin(tets, bad).any(axis=1)
+    return out if out.any() else np.asarray(np.isin(tets, bad).any(axis=1))
 
 
 def _largest_piece(tets: np.ndarray) -> np.ndarray:
