@@ -105,7 +105,8 @@ def vertex_forces(run: Run, frames: Iterable[int]) -> Iterator[tuple[np.ndarray,
         if forces is not None and forces.vertex_normal is not None and forces.vertex_friction is not None:
             yield forces.vertex_normal, forces.vertex_friction
         elif paper and run.records[frame]["step"] == 0:  # nothing has been pushed yet
-            yield (np.zeros((len(run.scripted), 3)),) * 2
+            nothing = np.zeros((len(run.scripted), 3))
+            yield nothing, nothing
         else:
             asked.append(frame)
             normal = barrier_forces(*next(states))

@@ -51,6 +51,7 @@ def test_a_pair_is_ignored_until_it_parts_and_then_keeps_apart():
     assert left[0] < -0.1
 
 
+@pytest.mark.filterwarnings("ignore::pdipc.scene.errors.SceneWarning")
 def test_what_starts_apart_is_not_quarantined():
     made = parting(quarantine=[["left", "third"], ["left", "right"]])
     with pytest.warns(SceneWarning, match='"left" and "third" start apart: no quarantine'):
