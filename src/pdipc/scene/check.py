@@ -19,6 +19,7 @@ from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import MOST, most_chords, movers_of
 from pdipc.scene.quarantine import Quarantine
+from pdipc.scene.reach import hints
 from pdipc.scene.schema import Cloth, Rigid, Rod, Scene, local_global_settings, uses_newton
 from pdipc.scene.separate import separate
 
@@ -65,7 +66,8 @@ def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[
     precision = precision or ("float32" if scene.simulation.precision == "float32" else "float64")
     complete = not (problems or part.problems)
     prepare(scene, assembly, precision)
-    return [*findings, *_turns(scene, assembly), *_check(assembly, precision, complete)], assembly.notes
+    found = [*findings, *_turns(scene, assembly), *_check(assembly, precision, complete)]
+    return found, assembly.notes if found else [*assembly.notes, *hints(scene, assembly)]
 
 
 def check_placed(assembly: Assembly, positions: np.ndarray, precision: str, body: int) -> list[Finding]:

@@ -1,0 +1,56 @@
+"""`check-scene` tells where the activation distance is small beside a step, or large beside a body."""
+
+import pytest
+from typer.testing import CliRunner
+
+import pdipc
+from pdipc.cli import app
+from pdipc.scene.assembly import assemble
+from pdipc.scene.reach import hints
+
+CLOTH = {"name": "cloth", "kind": "cloth", "mesh": {"shape": "grid", "cells": [4, 4]}, "translation": [0, 0.5, 0]}
+BALL = {"name": "ball", "mesh": {"shape": "sphere", "radius": 0.2}}
+
+
+def of(activation=1e-3, velocity=(0, 0, 0), motion=None, step=0.01):
+    ball = {**BALL, **({} if motion is None else {"motion": motion})}
+    scene = pdipc.Scene(
+        simulation={"time_step": step, "steps": 20},
+        contact={"activation_distance": activation},
+        bodies=[{**CLOTH, "velocity": list(velocity)}],
+        obstacles=[ball],
+    )
+    return hints(scene, assemble(scene))
+
+
+def test_nothing_is_said_of_a_usual_scene():
+    assert of() == []
+    assert of(velocity=(0, -9.9, 0)) == []
+
+
+@pytest.mark.parametrize("step", [1e-3, 1e-2, 1e-1])
+def test_a_fast_body_is_named_with_its_step(step):
+    (line,) = of(velocity=(0, -11 * 0.1 / step * 1.0, 0), activation=1e-2, step=step)
+    assert '"cloth"' in line and "110 times" in line
+
+
+def test_a_fast_obstacle_is_named():
+    (line,) = of(motion={"velocity": [0, -12, 0]})
+    assert '"ball"' in line and "12 m/s" in line
+    (line,) = of(motion={"angular_velocity": [0, 100, 0]})  # the fastest vertex: 20 m/s, on chords somewhat less
+    assert '"ball"' in line
+
+
+def test_an_activation_distance_that_is_large_beside_a_body():
+    (line,) = of(activation=0.1)
+    assert "7 % of the size" in line  # of a diagonal of sqrt(2) m
+
+
+def test_check_scene_prints_it(tmp_path):
+    scene = tmp_path / "fast.toml"
+    scene.write_text(
+        'bodies = [{ name = "cloth", kind = "cloth", mesh = { shape = "grid", cells = [4, 4] }, velocity = [0.0, -20.0, 0.0] }]\n'
+    )
+    result = CliRunner().invoke(app, ["check-scene", str(scene)])
+    assert result.exit_code == 0
+    assert "20 m/s" in result.output.replace("\n", " ")
