@@ -49,7 +49,7 @@ def rebound(body, half, *, eps, speed, time_step, phase, method="barrier", after
     simulation = {
         "time_step": time_step,
         "gravity": (0, 0, 0),
-        "tolerance": 1e-4,
+        "tolerance": 5e-5,
     }  # energy and eps hold as far as steps converge
     made = pdipc.Simulation(scene([body], [floor(2.0)], contact=contact, **simulation), "cpu")
     made.observe = Witness(made)
