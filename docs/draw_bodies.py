@@ -88,7 +88,7 @@ def everything() -> pdipc.Scene:
     sheet = {
         "name": "sheet",
         "kind": "cloth",
-        "mesh": {"shape": "grid", "size": (0.6, 0.6), "cells": (24, 24)},
+        "mesh": {"shape": "grid", "size": (0.5, 0.5), "cells": (16, 16)},
         "translation": (0, 0.18, 0),
     }
     bodies: list = [{**sheet, "minimum_separation": 1e-3}]
@@ -120,7 +120,7 @@ def everything() -> pdipc.Scene:
     ring = {"shape": "torus", "major_radius": 0.05, "minor_radius": 0.015, "cells": (6, 24)}
     bodies.append({"name": "ring", "kind": "rigid", "mesh": ring, "translation": (-0.05, 0.5, 0.03), "material": steel})
     floor = {"name": "floor", "mesh": {"shape": "plane", "size": 4.0}, "translation": (0, -0.15, 0)}
-    simulation = {"time_step": 0.01, "steps": 90}
+    simulation = {"time_step": 0.01, "steps": 50}
     return pdipc.Scene(bodies=bodies, obstacles=[ball, floor], simulation=simulation, contact={"friction": 0.4})
 
 
@@ -129,7 +129,7 @@ PICTURES = {
     "knot": (knot, (0, 70, 110), (0.1, 0.3, 1.0)),
     "rope_ladder": (ladder, (0, 80, 130), (0.9, 0.25, 0.8)),
     "chain": (chain, (0, 45, 110), (0.3, 0.2, 1.0)),
-    "all_kinds": (everything, (0, 30, 90), (0.7, 0.4, 1.0)),
+    "all_kinds": (everything, (0, 25, 50), (0.7, 0.4, 1.0)),
 }
 
 
