@@ -27,7 +27,9 @@ def draw(seed: int) -> pdipc.Scene:
     for k in range(rng.integers(1, 3)):
         place = {
             "name": f"body{k}",
-            "translation": (size * np.array([rng.uniform(-0.3, 0.3), rng.uniform(0.4, 0.6) + 0.7 * k, rng.uniform(-0.3, 0.3)])).tolist(),
+            "translation": (
+                size * np.array([rng.uniform(-0.3, 0.3), rng.uniform(0.4, 0.6) + 0.7 * k, rng.uniform(-0.3, 0.3)])
+            ).tolist(),
             "rotation": rng.uniform(0.0, 90.0, 3).tolist(),
             "velocity": rng.uniform(-fastest, fastest, 3).tolist(),
             "angular_velocity": rng.uniform(-10.0, 10.0, 3).tolist(),
@@ -42,7 +44,10 @@ def draw(seed: int) -> pdipc.Scene:
             mesh = {"shape": "grid", "size": [0.4 * size, 0.4 * size], "cells": rng.integers(3, 9, 2).tolist()}
             bodies.append({**place, "kind": "cloth", "mesh": mesh})
     floor = {"name": "floor", "mesh": {"shape": "plane", "size": 4.0 * size}}
-    rod = {"name": "rod", "mesh": {"shape": "cylinder", "radius": size * 10.0 ** rng.uniform(-3.0, -1.3), "length": size, "cells": [8, 1]}}
+    rod = {
+        "name": "rod",
+        "mesh": {"shape": "cylinder", "radius": size * 10.0 ** rng.uniform(-3.0, -1.3), "length": size, "cells": [8, 1]},
+    }
     rod |= {"rotation": [90.0, rng.uniform(0.0, 90.0), 0.0], "translation": [0.0, 0.12 * size, 0.0]}
     plate = {"name": "plate", "mesh": {"shape": "plane", "size": size}, "rotation": [180.0, 0.0, 0.0]}
     plate |= {"translation": [0.0, 2.0 * size, 0.0], "motion": {"velocity": [0.0, -rng.uniform(0.0, fastest), 0.0]}}

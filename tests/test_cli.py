@@ -332,7 +332,7 @@ def test_figures_are_listed():
     listed = runner.invoke(app, ["reproduce", "--list"])
     assert listed.exit_code == 0, listed.stderr
     told = dict(line.split(maxsplit=1) for line in listed.stdout.splitlines())
-    assert {"fig2", "fig12", "armadillo"} < set(told)
+    assert {"fig2", "fig12", "table1"} < set(told)
     assert list(told).index("fig2") < list(told).index("fig12")
 
 
