@@ -2,7 +2,7 @@
 
 It needs a checkout and the package's own dependencies; the package need not be installed. Parts by name (--only), in order of worth: bundled
 scenes step on CUDA as on the CPU, with the same bits again, and without intersections (`scenes`); kernels against the CPU (`kernels`,
-`ccd`) and solvers against SciPy (`solvers`); then times of the peers' scenes, of the bundled ones, of CCD and of the solvers
+`ccd`) and solvers against SciPy (`solvers`); then times of the peers' scenes, of the bundled ones, of Table 1, of CCD and of the solvers
 (Fig. 8), and each kernel's own.
 
 A machine that is lent for minutes should neither compile nor compute references: `--prepare FOLDER --arch 90` does both where there is
@@ -87,6 +87,7 @@ PARTS = {
     "solvers": Part(checks.check_solver, checks.solver_cases, 30, together=True),
     "peer scenes": Part(times.time_scene, times.peer_cases, 25),
     "bundled scenes": Part(times.time_scene, times.bundled_cases, 15),
+    "paper scenes": Part(times.time_scene, times.paper_cases, 25),
     "ccd times": Part(times.time_ccd, times.ccd_cases, 20),
     "sweeps": Part(times.time_sweeps, times.sweep_cases, 40),
     "profile": Part(times.profile, times.profile_cases, 30),
