@@ -8,7 +8,7 @@ of processor time are done.
 
 Prints, and writes to benchmarks/results/newton_examples.json: processor ms and wall ms a frame, unconverged steps (SolverVBD has no such
 notion), intersecting frames and the most pairs of triangles that intersect in one, judged by the witness with obstacles as pdipc sees them;
-how far the solvers' last common frames are apart; and a picture of both, benchmarks/results/newton_NAME.png.
+how far the solvers' last common frames are apart; and a picture of both, docs/newton_NAME.png.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
+PICTURES = Path(__file__).parents[1] / "docs"
 EXAMPLES = {
     "cloth_hanging": ("cloth", [], ["--width", "20", "--height", "10"]),
     "softbody_hanging": ("softbody", [("dim_x = 12", "dim_x = 6"), ("dim_y = 4", "dim_y = 2"), ("dim_z = 4", "dim_z = 2")], []),
@@ -209,7 +210,7 @@ def draw(name: str, sides: dict[str, dict], frame: int, folder: Path) -> Path:
         place.set_title(f"{name}, frame {frame}: {side}")
         place.axis("off")
     figure.tight_layout()
-    path = RESULTS / f"newton_{name}.png"
+    path = PICTURES / f"newton_{name}.png"
     figure.savefig(path, dpi=75)
     plt.close(figure)
     return path

@@ -8,7 +8,9 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-@pytest.mark.parametrize(("page", "least"), [("tutorial", 6), ("forces", 1), ("starts", 1)])
+@pytest.mark.parametrize(
+    ("page", "least"), [("tutorial", 6), ("forces", 1), ("starts", 1), ("index", 1), ("meshes", 4), ("settings", 2)]
+)
 def test_every_block_of_a_page(page, least):
     names: dict = {}
     text = (DOCS / f"{page}.md").read_text()

@@ -58,6 +58,7 @@ mesh = {{ shape = "sphere", radius = 0.3, cells = 12 }}
 ```
 
 A mesh is one of
+
 - a file, relative to the scene file: tets from {" ".join(TET_SUFFIXES)}, triangles from {" ".join(TRIANGLE_SUFFIXES)},
   lines from .obj, `.npz` with V and T, F or L, and USD (with the extra "usd"), whole or below a prim: `shot.usda</World/Flag>`; `warp:bear.usd` is the
   file of that name among Warp's own assets;
@@ -76,10 +77,12 @@ is said by `pdipc run` and `pdipc check-scene`, and in Python by a SceneWarning.
 
 An obstacle may deform: `motion = {{ cache = "dance.npz", frame_rate = 25 }}`, see [Deformation](#deformation).
 
-A vertex of the mesh starts at translation + R (scale * vertex). Distances that a scene leaves open follow from its size L, the
-diagonal of the bounding box of all bodies at the start: the activation distance is 1e-3 L, the minimum separation 0.02 of that.
+A vertex of the mesh starts at translation + R (scale * vertex). Distances that a scene leaves open follow from the size of
+its largest body, the diagonal of that body's bounding box at the start: the activation distance is 1e-3 of it, the minimum separation 0.02
+of that.
 
 Bundled scenes, which can be run by name:
+
 """
 
 

@@ -141,7 +141,7 @@ def local_global_settings(simulation: Simulation) -> list[str]:
 
 
 class Contact(Table):
-    """How surfaces keep apart. Distances that are absent follow from the scene size: see `pdipc.scene.assembly.Assembly`."""
+    """How surfaces keep apart. Distances that are absent follow from the sizes of bodies: see `pdipc.scene.assembly.Assembly`."""
 
     method: Literal["barrier", "paper"] = Field(
         default="barrier",
@@ -150,7 +150,7 @@ class Contact(Table):
     )
     activation_distance: Positive | None = Field(
         default=None,
-        description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the scene size; at least 1e-7 of it.",
+        description="Gap at which the barrier sets in (d_hat), m; absent: 1e-3 of the largest body's size; at least 1e-7 of it.",
     )
     minimum_separation: Positive | None = Field(
         default=None,
