@@ -403,7 +403,7 @@ def total_share(real: Real) -> wp.Function:
             total_of_vertex += shares[i]
         return total_of_vertex
 
-    return total
+    return total  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
 
 
 @dataclass

@@ -142,7 +142,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.func
     def sampled(k: int, number: int, count: int) -> int:
         """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
-        return (k * count) / number + (k * 37) % (count / number)
+        # In Warp's language the quotient of integers is one.
+        return (k * count) / number + (k * 37) % (count / number)  # pyright: ignore[reportReturnType]
 
     @wp.kernel(module=module)
     def find_turn(

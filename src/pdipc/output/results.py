@@ -288,7 +288,7 @@ class Run:
         """Pairs of bodies, by ascending numbers, that ignored each other in the step that led to `frame`, so that they may intersect in it."""
         numbers = {name: number for number, name in enumerate(self.body_names)}
         named = self.records[frame].get("quarantined", ())
-        return [tuple(sorted(numbers[name] for name in pair)) for pair in named]
+        return [(min(a, b), max(a, b)) for a, b in ((numbers[one], numbers[other]) for one, other in named)]
 
     def excused(self, frame: int, pairs: np.ndarray) -> np.ndarray:
         """(k,) bool: which pairs (k, 2) of triangles belong to bodies that ignored each other in the step that led to `frame`."""

@@ -80,7 +80,7 @@ def _quads(points: np.ndarray, rings: np.ndarray) -> tuple[np.ndarray, int]:
     with np.errstate(over="ignore", invalid="ignore"):
         (least_one, size_one), (least_other, size_other) = least(one), least(other)
     turned = (least_other > 0) & (least_other > BETTER * least_one)
-    crossed = np.count_nonzero((np.maximum(least_one, least_other) <= 0) & (size_one > 0) & (size_other > 0))
+    crossed = int(np.count_nonzero((np.maximum(least_one, least_other) <= 0) & (size_one > 0) & (size_other > 0)))
     return np.where(turned[:, None, None], rings[:, other], rings[:, one]), crossed
 
 

@@ -560,7 +560,8 @@ def _nearer(assembly: Assembly, primitives: list[np.ndarray], reach: np.ndarray,
             owners = np.sort(assembly.body_of_vertex[np.column_stack([i[:, 0], j[:, 0]])], axis=1)
             found.append((distances[close], limits[close], owners, _place(x[i], x[j]) if first is second else x[i][:, 0]))
     nothing = (np.zeros(0), np.zeros(0), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)))
-    return tuple(np.concatenate(column) for column in zip(nothing, *found, strict=True))
+    distances, limits, owners, places = (np.concatenate(column) for column in zip(nothing, *found, strict=True))
+    return distances, limits, owners, places
 
 
 def _place(e: np.ndarray, f: np.ndarray) -> np.ndarray:

@@ -427,7 +427,7 @@ def tetrahedralize(mesh: Mesh, where: str) -> Mesh:
     Raises SceneError where pytetwild is not installed or makes no tets.
     """
     try:
-        import pytetwild
+        import pytetwild  # pyright: ignore[reportMissingImports]  (an extra)
     except ImportError as error:
         raise SceneError(
             f'{where}: "tetrahedralize" needs the extra: pip install "pdipc[tetrahedralize]"; or give a tetrahedral mesh'

@@ -30,7 +30,7 @@ def corners_at_rest(cloth: Cloth, triangles: int) -> np.ndarray:
             mesh = meshes.from_arrays(source.vertices, source.tets, source.triangles, "mesh", drop_unused=False)
             points, faces = mesh.vertices, mesh.triangles
         else:
-            mesh = source.mesh().surface()
+            mesh = source.mesh().surface()  # pyright: ignore[reportOptionalMemberAccess]  (without uv there is one)
             points, faces = mesh.vertices, mesh.triangles
         if len(faces) != triangles:
             raise SceneError(f"has {len(faces)} triangles; the cloth has {triangles}, and each needs one, in the same order")

@@ -1,6 +1,6 @@
 """What all tables of a scene share: strict numbers, no unknown keys, and SceneError for what is wrong."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -26,10 +26,13 @@ Index = Annotated[Whole, Field(ge=0)]
 Vector = tuple[Number, Number, Number]
 
 
+_T = TypeVar("_T")
+
+
 class _Model(type(BaseModel)):
     """Makes tables in Python raise what files raise."""
 
-    def __call__(cls, *args: Any, **tables: Any) -> Any:
+    def __call__(cls: type[_T], *args: Any, **tables: Any) -> _T:  # tables may be dictionaries; what comes out has its type
         try:
             return super().__call__(*args, **tables)
         except ValidationError as error:
