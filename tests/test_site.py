@@ -64,6 +64,14 @@ def test_every_public_name_is_in_the_reference_once():
     assert sorted(re.findall(r"^::: pdipc\.(\w+)$", (DOCS / "api.md").read_text(), flags=re.MULTILINE)) == sorted(pdipc.__all__)
 
 
+def test_python_of_every_page_is_run():
+    """Somewhere in the tests: each page that has any is named there."""
+    tests = "".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py") if path != Path(__file__))
+    for page in DOCS.glob("*.md"):
+        if "```python" in page.read_text():
+            assert f'"{page.stem}"' in tests or f'"{page.name}"' in tests, page.name
+
+
 def test_lists_and_tables_have_space_above():
     """Without it the site, unlike GitHub, makes them part of the paragraph."""
     for page in DOCS.glob("*.md"):

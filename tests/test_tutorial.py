@@ -9,7 +9,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 @pytest.mark.parametrize(
-    ("page", "least"), [("tutorial", 6), ("forces", 1), ("starts", 1), ("index", 1), ("meshes", 4), ("settings", 2)]
+    ("page", "least"),
+    [("tutorial", 6), ("forces", 1), ("starts", 1), ("index", 1), ("meshes", 4), ("settings", 2), ("runs", 1), ("ccd", 1)],
 )
 def test_every_block_of_a_page(page, least):
     names: dict = {}
