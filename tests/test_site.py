@@ -72,6 +72,12 @@ def test_python_of_every_page_is_run():
             assert f'"{page.stem}"' in tests or f'"{page.name}"' in tests, page.name
 
 
+def test_every_benchmark_is_listed():
+    listed = set(re.findall(r"`(\w+\.py)`", (DOCS / "benchmarks.md").read_text()))
+    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py") if '__name__ == "__main__"' in path.read_text()}
+    assert scripts <= listed <= {path.name for path in (ROOT / "benchmarks").glob("*.py")}
+
+
 def test_lists_and_tables_have_space_above():
     """Without it the site, unlike GitHub, makes them part of the paragraph."""
     for page in DOCS.glob("*.md"):
