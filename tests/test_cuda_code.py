@@ -1,7 +1,7 @@
 """The CUDA code of everything a step launches compiles, whether or not the machine has a GPU (linear solvers: tests/linear).
 
 Each module is compiled for one of four architectures, in turn, in float32, and a third of them in float64 as well; with PDIPC_ALL_ARCHITECTURES
-set for all of them in both, which takes six times as long.
+set for all of them in both, which takes several times as long.
 """
 
 import os

@@ -281,10 +281,11 @@ def kernels(real: Real) -> SimpleNamespace:
         squeezed: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         accepted_out: wp.array(dtype=wp.int32),
+        lowered_out: wp.array(dtype=wp.int32),
         searching_out: wp.array(dtype=wp.int32),
     ):
-        """Whether the potential of each island has not risen. before, after, squeezed: (bodies,)
-        scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
+        """Whether the potential of each island has not risen; lowered: whether that of any has fallen by more than rounding. before, after,
+        squeezed: (bodies,) scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
         for b in range(bodies):
             before[b] = wide(0.0)
             after[b] = wide(0.0)
@@ -298,11 +299,15 @@ def kernels(real: Real) -> SimpleNamespace:
             if driven[b] != 0:
                 accepted_out[label[b]] = 1
         searching = int(0)
+        lowered_out[0] = 0
         for b in range(bodies):
             island = label[b]
             ok = accepted_out[island]
-            if after[island] <= before[island] + slack * wp.abs(before[island]) + negligible or attempts[0] > HALVINGS:
+            unseen = slack * wp.abs(before[island]) + negligible
+            if after[island] <= before[island] + unseen or attempts[0] > HALVINGS:
                 ok = 1
+            if after[island] < before[island] - unseen:
+                lowered_out[0] = 1
             if squeezed[island] != 0 and attempts[0] == 0:
                 ok = 0
             accepted_out[b] = ok
@@ -551,6 +556,7 @@ def kernels(real: Real) -> SimpleNamespace:
         script: wp.array(dtype=wp.int32),
         projected: wp.array(dtype=wp.int32),
         restrained: wp.array(dtype=wp.int32),
+        lowered: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
         tolerance: scalar,
@@ -594,10 +600,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if projected[0] != 0:
                 left = left / scalar(EXACT)
-            # a step that is short beside the tolerance, and yet lowers nothing, is what rounding leaves of the forces: the way that is left cannot
-            # be seen in the potential, and a Hessian that is too soft makes steps too long
+            # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = left <= tolerance and attempts[0] == 1
-            if attempts[0] > 1 and residual <= scalar(EXACT) * tolerance:
+            if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
             if residual >= scalar(wp.inf):
@@ -612,6 +617,11 @@ def kernels(real: Real) -> SimpleNamespace:
                 code = status.OUT_OF_TIME
             elif count[status.SINCE] >= max_outer:
                 code = status.CAPPED
+        # what is held back wants less than it would: a step that ends so tells of the last motion that was wanted freely
+        if restrained[0] == 0:
+            numbers[status.MOVED_FREELY] = residual
+        elif code != status.RUNNING:
+            numbers[status.MOVED] = wp.max(residual, numbers[status.MOVED_FREELY])
         count[status.STATUS] = code
         going_out[0] = 0
         if code == status.RUNNING:
@@ -716,7 +726,8 @@ class Newton:
             self.project,
             self.renew,
             self.restrained,
-        ) = (zeros(wp.int32, 1) for _ in range(7))
+            self.lowered,
+        ) = (zeros(wp.int32, 1) for _ in range(8))
         self.nobody = zeros(wp.int32, len(work.script.movers))
         self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
@@ -900,7 +911,7 @@ class Newton:
             w.candidates.overflow,
             self.tolerated**2,
         ]
-        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.searching]
+        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.lowered, self.searching]
         judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
         device.launch_serial(k.judge, judging)
 
@@ -931,7 +942,7 @@ class Newton:
             device.launch(k.crowd, p.capacity, inputs)
         w.script.advance(w.x_start, w.u, t.fraction)
         s = model.settings
-        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, self.restrained]
+        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, self.restrained, self.lowered]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
         times = [w.candidates.overflow, w.clock]
         device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])

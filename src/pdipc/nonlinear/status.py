@@ -13,6 +13,7 @@ STATUS, OUTER, TRUNCATIONS, BARRIERS, SEARCHES, STALLED, MOVING, SINCE = (wp.con
 COUNTS = 8
 
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
-# the largest force of inertia, to compare it with; how far something scripted is behind, m
-MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE = (wp.constant(place) for place in range(5))
-NUMBERS = 5
+# the largest force of inertia, to compare it with; how far something scripted is behind, m; the motion that the iteration before wanted, and
+# the one that last wanted it while nothing was held back, m
+MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY = (wp.constant(place) for place in range(6))
+NUMBERS = 6

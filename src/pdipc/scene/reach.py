@@ -1,7 +1,7 @@
 """What the activation distance means beside bodies and steps: hints, not findings, since any distance is feasible.
 
-Measured on a falling cloth and on soft blocks: where a step goes over a hundred activation distances, the outer iterations that find
-the contact are most of the step; where one is more than a twentieth of a body, its contact is felt as an air gap.
+A step that goes over many activation distances meets the barrier only after CCD has cut it, again and again; and a body of few of them is held off by
+an air gap that can be seen. Where many and few begin is a choice.
 """
 
 import itertools
@@ -25,8 +25,8 @@ def hints(scene: Scene, assembly: Assembly) -> list[str]:
         if np.isfinite(speed) and speed * h > FAR * d_hat:
             found.append(
                 f'"{body.name}" moves {speed:.3g} m/s, {speed * h / d_hat:.0f} times the activation distance of {d_hat:.3g} m '
-                f"a step: steps in contact take many outer iterations; a time step of {FAR * d_hat / speed:.2g} s, or an "
-                f"activation distance of {speed * h / FAR:.2g} m, takes fewer"
+                f"a step: steps in contact may take many outer iterations; a time step of {FAR * d_hat / speed:.2g} s, or an "
+                f"activation distance of {speed * h / FAR:.2g} m, may take fewer"
             )
         size = float(np.linalg.norm(np.ptp(assembly.positions[own], axis=0)))
         if not body.kinematic and d_hat > THICK * size:
