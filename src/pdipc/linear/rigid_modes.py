@@ -160,8 +160,25 @@ class RigidModes:
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """What gathers into C. A group's row of 6x6 blocks is written by its own worker only."""
-    _scalar, vec3 = real.scalar, real.vec3
-    vec6 = wp.types.vector(MODES, wp.float64)
+    vec3, mat33 = real.vec3, real.mat33
+    wide, wide33 = wp.float64, wp.mat33d
+    vec6 = wp.types.vector(MODES, wide)
+
+    @wp.func
+    def widened(a: mat33) -> wide33:
+        return wide33(
+            wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
+            wide(a[1, 0]), wide(a[1, 1]), wide(a[1, 2]),
+            wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
+        )  # fmt: skip
+
+    @wp.func
+    def skew(a: vec3) -> wide33:
+        zero = wide(0.0)
+        x = wide(a[0])
+        y = wide(a[1])
+        z = wide(a[2])
+        return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
 
     @wp.func
     def mode(arm: vec3, direction: vec3) -> vec6:
@@ -180,7 +197,7 @@ def functions(real: Real) -> SimpleNamespace:
             for j in range(MODES):
                 c[at + j] = c[at + j] + own * b[j]
 
-    return SimpleNamespace(mode=mode, add_outer=add_outer, vec6=vec6)
+    return SimpleNamespace(widened=widened, skew=skew, mode=mode, add_outer=add_outer, vec6=vec6)
 
 
 @functools.cache
@@ -189,7 +206,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = functions(real)
     vec6 = f.vec6
-    wide, _wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
+    wide, wide33 = wp.float64, wp.mat33d
 
     @wp.func_native(_FACTORIZE.replace("LOST", repr(LOST)))
     def factorize_rows(
@@ -228,22 +245,6 @@ def kernels(real: Real) -> SimpleNamespace:
             scale = scalar(1.0) / wp.sqrt(square / scalar(starts[g + 1] - starts[g]))
             for k in range(starts[g], starts[g + 1]):
                 arms_out[members[k]] = scale * arms_out[members[k]]
-
-    @wp.func
-    def widened(a: mat33) -> wide33:
-        return wide33(
-            wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
-            wide(a[1, 0]), wide(a[1, 1]), wide(a[1, 2]),
-            wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
-        )  # fmt: skip
-
-    @wp.func
-    def skew(a: vec3) -> wide33:
-        zero = wide(0.0)
-        x = wide(a[0])
-        y = wide(a[1])
-        z = wide(a[2])
-        return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
 
     @wp.func
     def add_block(c: wp.array(dtype=wide), size: int, g: int, h: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33):
@@ -285,7 +286,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for m in range(starts[g], starts[g + 1]):
             i = members[m]
             # Z_i = [I, -[arm]x]; its transpose is [I; [arm]x]
-            own = skew(arms[i])
+            own = f.skew(arms[i])
             mass = wide(held[i])
             tt += mass * identity
             tr -= mass * own
@@ -294,10 +295,10 @@ def kernels(real: Real) -> SimpleNamespace:
             for e in range(offsets[i], offsets[i + 1]):
                 j = columns[e]
                 h = label[j]
-                k = widened(values[e])
+                k = f.widened(values[e])
                 if h == g:
                     # translations cancel, rotations leave the difference of the arms
-                    turned = k * (own - skew(arms[j]))
+                    turned = k * (own - f.skew(arms[j]))
                     tr += turned
                     rr += own * turned
                 else:
@@ -308,7 +309,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     rt -= lever
                     rr += own * turned
                     if h >= low[g] and h < g:
-                        far = skew(arms[j])
+                        far = f.skew(arms[j])
                         kf = k * far
                         add_block(c, size, g, h, k, -kf, lever, -(own * kf))
         add_block(c, size, g, g, tt, tr, rt, rr)

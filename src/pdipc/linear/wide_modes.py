@@ -21,6 +21,7 @@ import warp as wp
 from pdipc.device import blocks
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device, Span
 from pdipc.device.precision import Real
+from pdipc.linear import rigid_modes
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import LOST, MODES, RigidModes
 
@@ -99,26 +100,10 @@ class WideModes(RigidModes):
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    vec3, mat33 = real.vec3, real.mat33
     wide, wide33 = wp.float64, wp.mat33d
+    shared = rigid_modes.functions(real)
     vec6 = wp.types.vector(MODES, wide)
     of_block, block_sum = blocks.total(wide33), blocks.total(vec6)
-
-    @wp.func
-    def widened(a: mat33) -> wide33:
-        return wide33(
-            wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
-            wide(a[1, 0]), wide(a[1, 1]), wide(a[1, 2]),
-            wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
-        )  # fmt: skip
-
-    @wp.func
-    def skew(a: vec3) -> wide33:
-        zero = wide(0.0)
-        x = wide(a[0])
-        y = wide(a[1])
-        z = wide(a[2])
-        return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
 
     @wp.func
     def part(i: int, j: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33) -> wide:
@@ -154,7 +139,9 @@ def functions(real: Real) -> SimpleNamespace:
             if g != h:
                 c[(MODES * h + j) * size + MODES * g + i] = value
 
-    return SimpleNamespace(widened=widened, skew=skew, of_block=of_block, block_sum=block_sum, part=part, add=add, vec6=vec6)
+    return SimpleNamespace(
+        widened=shared.widened, skew=shared.skew, of_block=of_block, block_sum=block_sum, part=part, add=add, vec6=vec6
+    )
 
 
 @functools.cache
@@ -167,8 +154,6 @@ def kernels(real: Real) -> SimpleNamespace:
     mat66 = wp.types.matrix((MODES, MODES), wide)
     lost = wp.constant(wide(LOST))
     total_of, total_number = blocks.total(vec3), blocks.total(scalar)
-    from pdipc.linear import rigid_modes
-
     mode = rigid_modes.functions(real).mode
 
     @wp.kernel(module=module)
