@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -89,8 +88,9 @@ def nearest(
         return np.zeros((0, 4), dtype=np.int32), np.zeros((0, 3))
     points, corners = positions[vertices[row]], positions[targets[which]]
     if surface:
-        place = trimesh.triangles.closest_point(corners, points)
-        weights = np.clip(trimesh.triangles.points_to_barycentric(corners, place), 0.0, None)
+        from trimesh.triangles import closest_point, points_to_barycentric
+
+        weights = np.clip(points_to_barycentric(corners, closest_point(corners, points)), 0.0, None)
         weights /= weights.sum(axis=1, keepdims=True)
     else:
         along = corners[:, 1] - corners[:, 0]
