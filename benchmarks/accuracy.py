@@ -2,7 +2,7 @@
 
 An Armadillo of 9K tets (optional data, else a ball) is flattened between two boards, and three bodies fall into a box. Both run on
 the same CPU in one go, from the same model: same meshes, masses, energies, barrier and minimum separation. IPC is the projected Newton of
-benchmarks/baselines with a supernodal Cholesky. Writes benchmarks/results/accuracy.json.
+pdipc.baselines with a supernodal Cholesky. Writes benchmarks/results/accuracy.json.
 """
 
 import argparse
@@ -17,11 +17,9 @@ from pathlib import Path
 import numpy as np
 
 import pdipc
+from pdipc.baselines.common import Cholesky
+from pdipc.baselines.reference import Reference
 from pdipc.drive import Work, step
-
-sys.path.append(str(Path(__file__).parent))
-from baselines.common import Cholesky
-from baselines.reference import Reference
 
 DATA = Path(os.environ.get("PDIPC_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TOLERANCE = 1e-6  # m, of IPC's Newton iterations

@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
-from baselines import common, contact, energies, ipc
+from pdipc.baselines import common, contact, energies, ipc
 
 H, TOLERANCE = 0.01, 1e-5  # s; tolerance in scene sizes, as the simulator's default
 DATA = Path(os.environ.get("PDIPC_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -8,9 +8,8 @@ import pytest
 pytest.importorskip("ipctk", reason="needs ipctk (extra: benchmarks)")
 pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
 
-from baselines.reference import Reference
-
 import pdipc
+from pdipc.baselines.reference import Reference
 
 FLOOR = 1e-7  # of the scene size: IPC's own steps are solved to 1e-8 of it, and their errors add up
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from baselines import energies
+
+from pdipc.baselines import energies
 
 RNG = np.random.default_rng(7)
 REST = RNG.standard_normal((4, 3))

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("ipctk", reason="needs ipctk (extra: benchmarks)")
 pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
 
-from baselines import common, contact, energies, ipc
+from pdipc.baselines import common, contact, energies, ipc
 
 G, H, D_HAT, XI = 9.81, 0.01, 2e-3, 4e-5
 

@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
 
-from baselines import common, energies
-from baselines import projective_dynamics as pd
+from pdipc.baselines import common, energies
+from pdipc.baselines import projective_dynamics as pd
 
 G, H = 9.81, 0.01
 
@@ -18,7 +18,7 @@ def block(cells=(2, 2, 2), size=0.2, height=0.5, mu=2e4):
 
 
 def test_converges_to_the_minimum_that_newton_finds():
-    ipc = pytest.importorskip("baselines.ipc", reason="needs ipctk (extra: benchmarks)")
+    ipc = pytest.importorskip("pdipc.baselines.ipc", reason="needs ipctk (extra: benchmarks)")
     x, tets, masses, weight = block(mu=2e3)
     terms = [energies.tet_strain(x, tets, weight), energies.tet_volume(x, tets, weight)]
     kinematic = x[:, 1] > 0.59

@@ -144,9 +144,3 @@ def test_a_stopped_figure_goes_on_where_it_was(tmp_path):
     np.testing.assert_array_equal(again.positions(-1), whole)
     scene.simulation.steps = 2
     assert _common.simulated(scene, part, "other", "cpu").frame_count == 3
-
-
-def test_baselines_are_asked_for_where_there_is_no_checkout(tmp_path, monkeypatch):
-    monkeypatch.setattr(_common, "CHECKOUT", tmp_path)
-    with pytest.raises(FileNotFoundError, match="checkout"):
-        _common.baseline("ipc")

@@ -1,15 +1,12 @@
-"""What the figures share: optional data, runs that go on where they were stopped, the baselines, pictures, the last sentence."""
+"""What the figures share: optional data, runs that go on where they were stopped, pictures, the last sentence."""
 
 import csv
-import importlib
 import json
 import os
 import platform
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
@@ -29,22 +26,6 @@ def data(name: str) -> Path | None:
     """The file `name` of the optional data: in the folder PDIPC_DATA, else in `shared/data` beside a checkout. None: not there."""
     path = Path(os.environ.get("PDIPC_DATA", CHECKOUT.parent / "shared" / "data")) / name
     return path if path.exists() else None
-
-
-def baseline(name: str) -> ModuleType:
-    """A module of benchmarks/baselines, which come with a checkout and not with the installed package.
-
-    Raises FileNotFoundError where there is no checkout around this file.
-    """
-    folder = CHECKOUT / "benchmarks"
-    if not (folder / "baselines" / f"{name}.py").is_file():
-        raise FileNotFoundError(
-            f'this figure compares with the baseline "{name}", which is not part of the installed package; run it from a '
-            f'checkout of the repository that is installed with: pip install -e ".[benchmarks]" (looked for {folder})'
-        )
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
-    return importlib.import_module(f"baselines.{name}")
 
 
 # --- runs ---

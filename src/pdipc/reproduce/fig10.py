@@ -53,7 +53,9 @@ def falling(radius: float, small: bool) -> Scene:
 
 def plain(assembly: Assembly, time_step: float) -> Callable[[int, _common.Arrays], tuple[_common.Arrays, dict]]:
     """The step of plain projective dynamics: the same ARAP energy, and collisions where a vertex is inside a rod."""
-    common, energies, pd = (_common.baseline(name) for name in ("common", "energies", "projective_dynamics"))
+    from pdipc.baselines import common, energies
+    from pdipc.baselines import projective_dynamics as pd
+
     x, tets = assembly.rest_positions, assembly.tets
     volumes = energies.tet_volumes(x, tets)
     problem = pd.Problem(

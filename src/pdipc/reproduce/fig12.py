@@ -51,7 +51,8 @@ def flattened(small: bool) -> Scene:
 
 def newton(assembly: Assembly) -> Callable[[int, _common.Arrays], tuple[_common.Arrays, dict]]:
     """The step of IPC, projected Newton: the same ARAP energy, activation distance and minimum separation."""
-    common, energies, contact, ipc = (_common.baseline(name) for name in ("common", "energies", "contact", "ipc"))
+    from pdipc.baselines import common, contact, energies, ipc
+
     x, tets, scripted = assembly.rest_positions, assembly.tets, assembly.scripted
     volumes = energies.tet_volumes(x, tets)
     masses = common.lumped_tet_masses(len(x), tets, volumes, DENSITY)

@@ -45,9 +45,10 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    from pdipc.baselines import projective_dynamics as plain
+
     out, steps = Path(out_dir), 15 if small else 40
     out.mkdir(parents=True, exist_ok=True)
-    plain = _common.baseline("projective_dynamics")
     options = {"height": HEIGHT, "velocity": -SPEED, "steps": steps, "time_step": TIME_STEP, "restitution": RESTITUTION}
     heights = {
         label: plain.vertex_and_plane(method, activation=ACTIVATION, **options).heights for method, label in LABELS.items()

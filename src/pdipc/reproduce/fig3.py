@@ -35,10 +35,11 @@ def rebound(phase: float, device: str | None, *, stiffness: float = 100.0, **con
 
 def plain_rebound(weight: float, phase: float) -> float:
     """The same of a box of plain projective dynamics; weight: of the collision, in units of m/h^2."""
+    from pdipc.baselines import projective_dynamics as plain
+    from pdipc.baselines import reference
     from pdipc.constraints import material, tet_strain
     from pdipc.scene.generators import Box
 
-    plain, reference = _common.baseline("projective_dynamics"), _common.baseline("reference")
     mesh = Box(size=(SIDE, SIDE, SIDE), cells=(2, 2, 2)).mesh()
     strain, _ = material.solid(1e9, 0.0)
     x = mesh.vertices + np.array([0.0, 0.5 * SIDE + (1.0 + phase) * SPEED * TIME_STEP, 0.0])

@@ -160,7 +160,9 @@ def _ours(model: Model, steps: int):
 
 
 def _ipc(model: Model, steps: int):
-    reference = _common.baseline("reference").Reference(model)
+    from pdipc.baselines.reference import Reference
+
+    reference = Reference(model)
     for _ in range(steps):
         info = reference.step(tolerance=1e-6)
         yield (
