@@ -196,8 +196,8 @@ def draw(name: str, sides: dict[str, dict], frame: int, folder: Path) -> Path:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from pdipc.output.render import render
     from pdipc.output.results import open_run
+    from pdipc.pictures.render import render
     from pdipc.scene.looks import Picture
 
     figure, places = plt.subplots(1, len(sides), figsize=(6.4 * len(sides), 4.6))

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import pdipc
-from pdipc.output.render import Picture, render
+from pdipc.pictures.render import Picture, render
 
 matplotlib.use("Agg")
 

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from pdipc.simulation import Simulation as Simulation
     from pdipc.simulation import run_scene as run_scene
     from pdipc.simulation import simulate as simulate
-    from pdipc.sweeps import run_sweep as run_sweep
+    from pdipc.sweeps.run import run_sweep as run_sweep
 
 __version__ = "0.1.0"
 
@@ -152,7 +152,7 @@ _PUBLIC = {
     "load_scene": "pdipc.scene.load",
     "open_run": "pdipc.output.results",
     "run_scene": "pdipc.simulation",
-    "run_sweep": "pdipc.sweeps",
+    "run_sweep": "pdipc.sweeps.run",
     "simulate": "pdipc.simulation",
     "step": "pdipc.drive",
     "time_of_impact": "pdipc.collision.queries",

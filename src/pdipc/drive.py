@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from pdipc import algorithm, rigid
+from pdipc import algorithm
+from pdipc.bodies import rigid
 from pdipc.device.launch import one_at_a_time
+from pdipc.integration import status
 from pdipc.integration.inertia import CHORDS, FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
 from pdipc.model import Model, State
-from pdipc.nonlinear import status
 from pdipc.output.forces import ContactForces
 from pdipc.work import Work
 

@@ -9,21 +9,11 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from pdipc import cloth, constraints, rigid, rods
+from pdipc import constraints
+from pdipc.bodies import cloth
+from pdipc.bodies.elasticity import elasticity, speed_of_sound
 from pdipc.collision import surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
-from pdipc.constraints import (
-    axis_attachment,
-    corotated,
-    edge_length,
-    material,
-    neo_hookean,
-    point_attachment,
-    surface_attachment,
-    tet_strain,
-    tet_volume,
-    tets,
-)
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
 from pdipc.integration.loads import ExternalForces
@@ -35,7 +25,7 @@ from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
-from pdipc.scene.schema import ClothMaterial, RigidMaterial, RodMaterial, Scene, SolidMaterial, uses_newton
+from pdipc.scene.schema import Scene, uses_newton
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -280,7 +270,7 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
             typical = mass[own].sum() / body.count if len(body.handles) else mass[own].mean()
             per_vertex["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
             per_vertex["body_mass"][own] = mass[own].sum()
-            crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / _speed_of_sound(body.material)
+            crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / speed_of_sound(body.material)
             per_vertex["rigidity"][own] = h**2 / (h**2 + crossing**2)
     per_vertex["kappa"][~free] = per_vertex["body_mass"][~free] = 0.0
 
@@ -347,61 +337,3 @@ def _tolerance(sim, assembly: Assembly) -> float:
     if sim.outer_tolerance is not None:
         return sim.outer_tolerance * largest
     return min(TOLERANCE_SPEED * h, TOLERANCE_PART * smallest)
-
-
-def _speed_of_sound(of: SolidMaterial | ClothMaterial | RodMaterial | RigidMaterial) -> float:
-    """m/s, along the body."""
-    if isinstance(of, SolidMaterial):
-        return float(np.sqrt(of.young_modulus / of.density))
-    if isinstance(of, RigidMaterial):
-        return float(np.sqrt(of.shape_stiffness / of.density))
-    if isinstance(of, RodMaterial):
-        assert of.stretch_stiffness is not None  # its validator has set it
-        return float(np.sqrt(of.stretch_stiffness / (of.density * np.pi * of.radius**2)))
-    assert of.membrane_stiffness is not None
-    return float(np.sqrt(of.membrane_stiffness / of.areal_density))
-
-
-def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The constraints of all bodies (Section 3) and the lumped masses (n,) kg. newton: for that solver, see `SolidMaterial.model`."""
-    x, n = assembly.rest_positions, len(assembly.positions)
-    sets, mass = [], np.zeros(n)
-    for body in assembly.bodies:
-        m = body.material
-        if isinstance(m, SolidMaterial):
-            strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
-            model = m.model
-            if model == "auto":
-                model = "neo_hookean" if newton else "arap"
-            if model == "arap":
-                sets.append(tet_strain.rest(x, body.tets, strain))
-                if volume > 0.0:
-                    sets.append(tet_volume.rest(x, body.tets, volume))
-            else:
-                kind = corotated if model == "corotated" else neo_hookean
-                sets.append(kind.rest(x, body.tets, 0.5 * strain, volume / 3.0))
-            mass += material.lumped_mass(n, body.tets, m.density * tets.rest_shape(x, body.tets)[1])
-        elif isinstance(m, ClothMaterial):
-            own, its_mass = cloth.elasticity(assembly, body)
-            sets += own
-            mass += its_mass
-        elif isinstance(m, RigidMaterial):
-            own, its_mass = rigid.elasticity(x, body, m)
-            sets += own
-            mass += its_mass
-        elif isinstance(m, RodMaterial):
-            own, its_mass = rods.elasticity(x, body, m)
-            sets += own
-            mass += its_mass
-    for pin in assembly.pins:
-        if pin.anchored and pin.axes.all():
-            sets.append(point_attachment.rest(pin.points, pin.vertices, pin.stiffness))
-        elif pin.anchored:
-            axes = np.tile(pin.axes, (len(pin.vertices), 1))
-            sets.append(axis_attachment.rest(pin.points, pin.vertices, axes, pin.stiffness))
-        elif pin.active and pin.follow >= 0 and len(pin.elements):
-            sets.append(surface_attachment.rest(assembly.positions, pin.elements, pin.weights, pin.stiffness))
-    for a in assembly.attachments:
-        pairs = np.stack([a.vertices_a, a.vertices_b], axis=1)
-        sets.append(edge_length.rest(x, pairs, a.stiffness, a.rest_lengths))
-    return sets + cloth.seams(assembly), mass

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from pdipc.control import Controls
+from pdipc.audit.contact import collect, mean
+from pdipc.control.commands import Controls
+from pdipc.control.phases import model_at
 from pdipc.device.launch import one_at_a_time
 from pdipc.drive import StepResult, Work, step
-from pdipc.forces import collect, mean
 from pdipc.model import Model, State, build
-from pdipc.phases import model_at
 from pdipc.scene.schema import Scene
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from pdipc.collision.candidates import Candidates
 from pdipc.collision.truncation import Truncation
 from pdipc.device import system
 from pdipc.device.launch import Graph, one_at_a_time
-from pdipc.integration import inertia
+from pdipc.integration import inertia, status
 from pdipc.integration.loads import Loads
 from pdipc.integration.script import Lead, Script
 from pdipc.model import Model, State
-from pdipc.nonlinear import Method, status
+from pdipc.nonlinear import Method
 from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.nonlinear.newton import Newton
 from pdipc.paper_mode.printed import Printed

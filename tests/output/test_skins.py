@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import pdipc
+from pdipc.export.export import export
 from pdipc.output import skins
-from pdipc.output.export import export
 from pdipc.scene.assembly import assemble
 from pdipc.scene.meshes import is_closed
 

@@ -6,12 +6,12 @@ import scipy.optimize
 import warp as wp
 
 import pdipc
+from pdipc.bodies.elasticity import elasticity
 from pdipc.constraints import Projector
 from pdipc.device.launch import Device
 from pdipc.device.precision import real
 from pdipc.judge import boxes
 from pdipc.judge.exact import stays_apart_exactly
-from pdipc.model import elasticity
 from pdipc.scene.assembly import assemble
 
 from .scenes import clean, cloth, floor, rod, scene, solid, too_near, watched

@@ -12,7 +12,7 @@ from tests.viewer.test_viewer import CLOTH, scene
 pytest.importorskip("viser", reason="needs viser (extra: viewer)")
 
 from pdipc import viewer
-from pdipc.output.creases import split
+from pdipc.pictures.creases import split
 from pdipc.scene import generators
 from pdipc.viewer.engine import Engine
 from pdipc.viewer.stage import BESIDE, compass

@@ -131,7 +131,7 @@ def audit(
         _write_csv(csv, opened, taken, rows, contacts)
         typer.echo(str(csv))
     if out is not None:
-        from pdipc.output.plot import plot_audits
+        from pdipc.pictures.plot import plot_audits
 
         plot_audits(rows, opened.body_names, contacts, out)
         typer.echo(str(out))

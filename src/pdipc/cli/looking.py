@@ -120,8 +120,8 @@ def render(
     ] = False,
 ) -> None:
     """Make a picture or a film of a run. Options come before what the scene says in its tables `picture` and `look`."""
-    from pdipc.output import render as pictures
     from pdipc.output.results import open_run
+    from pdipc.pictures import render as pictures
 
     suffix = out.suffix.lower()
     if suffix not in (*pictures.STILL, *pictures.MOVING):
@@ -266,7 +266,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the frames of a run for other programs."""
-    from pdipc.output import export as exports
+    from pdipc.export import export as exports
     from pdipc.output.results import open_run
 
     outside_of_runs(out)

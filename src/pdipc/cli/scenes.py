@@ -65,7 +65,7 @@ def _tell(scene: str, findings: "list[Finding]") -> None:
 
 
 def _draw_start(scene: str, picture: Path) -> None:
-    from pdipc.output.starts import draw_start
+    from pdipc.pictures.starts import draw_start
     from pdipc.scene.assembly import assemble
     from pdipc.scene.check import prepare
 

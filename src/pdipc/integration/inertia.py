@@ -7,7 +7,7 @@ import warp as wp
 
 from pdipc.device import system
 from pdipc.device.precision import Real
-from pdipc.nonlinear import status
+from pdipc.integration import status
 
 # What a step reports after its counts, in one array that the host reads once: iterations, numbers, gap, then the stages' times.
 LOCAL_GLOBAL, LINEAR, GAP, FOREIGN, CHORDS, FIRST_NUMBER = (wp.constant(status.COUNTS + place) for place in range(6))

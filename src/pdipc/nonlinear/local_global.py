@@ -9,9 +9,9 @@ from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
+from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear import Translations
-from pdipc.nonlinear import status
 from pdipc.nonlinear.anderson import Anderson
 
 INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the tolerance

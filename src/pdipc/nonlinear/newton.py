@@ -37,12 +37,12 @@ from pdipc.device import blocks
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
+from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear import status
 
 FRICTION_LAGS = (
     12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached

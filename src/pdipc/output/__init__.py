@@ -1,1 +1,1 @@
-"""Results: run folders, pictures, exports, and the independent certificate."""
+"""Run folders: what a run writes, what is read of it, and how it is told of."""

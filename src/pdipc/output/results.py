@@ -369,11 +369,11 @@ class Run:
 
     def _repr_html_(self) -> str:
         """The last frame and a summary, for notebooks."""
-        return importlib.import_module("pdipc.output.inline").html_of_run(self)  # by name: see there
+        return importlib.import_module("pdipc.viewer.inline").html_of_run(self)  # by name: see there
 
     def show(self, height: int = 500) -> Any:
         """Plays it in a frame of a notebook, `height` pixels high; `close()` of what is returned ends it. Needs the extra "viewer"."""
-        return importlib.import_module("pdipc.output.inline").show_run(self, height)
+        return importlib.import_module("pdipc.viewer.inline").show_run(self, height)
 
     def segments(self) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
         """Step, outer iteration, start (n, 3) and end (n, 3) of every motion recorded for the frames that count."""

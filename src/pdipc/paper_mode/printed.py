@@ -7,8 +7,8 @@ import warp as wp
 
 from pdipc.barrier.pairs import Exerted
 from pdipc.device.precision import Real
+from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
-from pdipc.nonlinear import status
 from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.paper_mode.energy_rate import EnergyRate
 from pdipc.paper_mode.reactions import reactions

@@ -12,8 +12,8 @@ import numpy as np
 
 from pdipc.device.launch import Device
 from pdipc.judge.witness import find_intersections
-from pdipc.output.render import drawing, settings_of
 from pdipc.output.results import Run, RunWriter, open_run
+from pdipc.pictures.render import drawing, settings_of
 from pdipc.scene.assembly import assemble
 from pdipc.scene.schema import Scene
 from pdipc.simulation import run_scene

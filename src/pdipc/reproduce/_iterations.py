@@ -9,8 +9,8 @@ import warp as wp
 
 from pdipc.barrier.potential import EXTENSION
 from pdipc.drive import Work, step
+from pdipc.integration import status
 from pdipc.model import Model, State, build
-from pdipc.nonlinear import status
 from pdipc.paper_mode import energy_rate
 from pdipc.paper_mode.printed import Printed
 from pdipc.reproduce import _common

@@ -907,13 +907,13 @@ class Scene(Table):
 
     def _repr_html_(self) -> str:
         """The start, for notebooks."""
-        return importlib.import_module("pdipc.output.inline").html_of_scene(self)  # by name: see there
+        return importlib.import_module("pdipc.viewer.inline").html_of_scene(self)  # by name: see there
 
     def show(self, device: str | None = None, height: int = 500) -> Any:
         """Simulates it live in a frame of a notebook, `height` pixels high; `close()` of what is returned ends it. Needs the extra
         "viewer". Raises SceneError where it cannot be simulated.
         """
-        return importlib.import_module("pdipc.output.inline").show_scene(self, device, height)
+        return importlib.import_module("pdipc.viewer.inline").show_scene(self, device, height)
 
     def save(self, path: str | Path) -> None:
         """Writes TOML that `load_scene` reads as the same scene; what is the default is left out. Raises OSError where it cannot be

@@ -7,7 +7,7 @@ import scipy.sparse
 from scipy.sparse.linalg import cg
 
 from pdipc import constraints
-from pdipc.model import elasticity
+from pdipc.bodies.elasticity import elasticity
 from pdipc.simulation import Simulation
 
 # What is dragged is on a damped spring, in units of its own compliance, so that it follows alike in cloth and in heavy blocks. The

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pdipc.output.render import settings_of
+from pdipc.pictures.render import settings_of
 from pdipc.scene.looks import looks
 from pdipc.viewer.stage import HOST, PORT, Plot, Stage, badge, told
 
@@ -68,7 +68,7 @@ class Playback:
 
     def _pressure(self, frame: int) -> tuple[np.ndarray, float]:
         """(n,) Pa on bodies, and what the last colour stands for: of all frames, once."""
-        from pdipc.output.render import pressure
+        from pdipc.pictures.render import pressure
 
         if self._field is None:
             self.state.content = badge({}, "finding the pressures of all frames")

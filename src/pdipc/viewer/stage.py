@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pdipc.output import nearest
-from pdipc.output.creases import closed, split
-from pdipc.output.render import GLASS, HIDES_ALL, LARGE, OBSTACLE, PALETTE, SHARP_EDGE, VIEW
 from pdipc.output.skins import skin
+from pdipc.pictures import nearest
+from pdipc.pictures.creases import closed, split
+from pdipc.pictures.render import GLASS, HIDES_ALL, LARGE, OBSTACLE, PALETTE, SHARP_EDGE, VIEW
 from pdipc.scene.looks import Look, Picture
 from pdipc.viewer.guard import EVERYWHERE, Guard
 

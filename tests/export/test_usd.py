@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 import pdipc
-from pdipc.output import usd as writer
-from pdipc.output.export import Excerpt, export
+from pdipc.export import usd as writer
+from pdipc.export.export import Excerpt, export
 from pdipc.output.results import RunError, RunWriter, open_run
 from pdipc.scene.assembly import assemble
 from pdipc.scene.errors import SceneError

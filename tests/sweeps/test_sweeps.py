@@ -23,7 +23,7 @@ from pdipc.scene.errors import SceneError
 
 distributed = pytest.importorskip("distributed")
 
-PAGE = Path(__file__).parents[1] / "docs" / "sweeps.md"
+PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 SCENE = """
 [simulation]
 steps = 8

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdipc.output import legend
-from pdipc.output.creases import split
 from pdipc.output.results import Run, RunError
 from pdipc.output.skins import Skin
+from pdipc.pictures import legend
+from pdipc.pictures.creases import split
 from pdipc.scene.looks import Look, Picture, looks
 
 if TYPE_CHECKING:
-    from pdipc.output.shading import Camera
+    from pdipc.pictures.shading import Camera
 
 OVERSAMPLED = 2  # drawn pixels per pixel of a picture, along each side
 STILL = (".png", ".jpg")
@@ -130,7 +130,7 @@ def render_animation(
 
     Raises RunError where there are no frames, ValueError for another suffix or a transparent background.
     """
-    from pdipc.output.film import film
+    from pdipc.pictures.film import film
 
     path, settings = Path(path), settings or settings_of(run)
     if settings.background == "transparent":
@@ -210,7 +210,7 @@ class Drawing:
 
     def image(self, frame: int) -> np.ndarray:
         """(height, width, 3) uint8: the picture of a frame; with a fourth channel, of opacity, where the background is transparent."""
-        from pdipc.output import shading
+        from pdipc.pictures import shading
 
         self._move(frame)
         everywhere, depth = self._shot(lamp=False)
@@ -385,7 +385,7 @@ class Drawing:
         return vtk_to_numpy(colors).reshape(height, width, 3), vtk_to_numpy(depths).reshape(height, width)
 
     def _camera(self) -> "Camera":
-        from pdipc.output.shading import Camera
+        from pdipc.pictures.shading import Camera
 
         camera = self.plotter.camera
         away, up = np.array(camera.direction), np.array(camera.up)
@@ -639,7 +639,7 @@ def _cut(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _pressed(run: Run, positions: np.ndarray, values: np.ndarray, reach: float) -> Callable[[np.ndarray], np.ndarray]:
     """Takes points (k, 3) to the field's values (k,) at the nearest points of bodies, 0 where none is within `reach`, m."""
-    from pdipc.output import nearest
+    from pdipc.pictures import nearest
 
     bodies = ~run.obstacle[run.triangles[:, 0]]
     return lambda points: nearest.values(positions, run.triangles[bodies], values, points, reach)

@@ -10,8 +10,8 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pdipc.output.render import OBSTACLE, PALETTE, SHARP_EDGE
 from pdipc.output.results import Run, RunError
+from pdipc.pictures.render import OBSTACLE, PALETTE, SHARP_EDGE
 from pdipc.scene.meshes import USD_SUFFIXES, split_prim
 from pdipc.scene.motion import rotation_matrix
 

@@ -82,7 +82,7 @@ def _picture(run: Run) -> str:
     try:
         from PIL import Image
 
-        from pdipc.output.render import drawing, settings_of
+        from pdipc.pictures.render import drawing, settings_of
 
         last = run.frame_count - 1
         settings = settings_of(run).model_copy(update={"size": SIZE, **({"color": "body"} if isinstance(run, Start) else {})})

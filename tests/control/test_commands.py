@@ -234,7 +234,7 @@ def test_commands_to_nobody_and_of_nothing_are_refused():
 
 
 def test_the_page_on_commands_runs_as_it_stands():
-    text = (Path(__file__).parents[1] / "docs" / "control.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     assert blocks
     for block in blocks:

@@ -123,7 +123,7 @@ def _write_frames(root: Any, run: Run, pieces: dict[str, dict[str, Any]]) -> Non
 def _pressures(run: Run) -> Any:
     """(n,) Pa of each frame, at the vertices that the run, which may be an excerpt, has."""
     from pdipc.audit import vertex_forces
-    from pdipc.output.export import Excerpt
+    from pdipc.export.export import Excerpt
     from pdipc.output.forces import pressures
 
     whole, frames, vertices = (run.whole, run.taken, run.vertices) if isinstance(run, Excerpt) else (run, None, slice(None))

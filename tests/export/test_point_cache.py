@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pdipc.output.export import export
+from pdipc.export.export import export
 from pdipc.output.results import open_run
 from tests.output import runs
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pdipc.output import legend
 from pdipc.output.results import RunError, RunWriter, open_run
+from pdipc.pictures import legend
 from pdipc.scene.errors import SceneError
 from pdipc.scene.looks import Look, Picture
 from tests.output import runs
@@ -12,7 +12,7 @@ from tests.output import runs
 pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
 imageio = pytest.importorskip("imageio.v3", reason="needs imageio (extra: pictures)")
 
-from pdipc.output import render as rendering  # noqa: E402
+from pdipc.pictures import render as rendering  # noqa: E402
 
 SIZE = (160, 100)
 BLUE, ORANGE = 2, 0  # the channels that stand out in the first two colours of the palette: the ball, the cloth
@@ -136,7 +136,7 @@ def test_obstacles_that_hide_bodies_let_them_be_seen(tmp_path):
 
 def test_shadows_are_softer_the_further_away_what_throws_them(tmp_path):
     """The half shadow of an edge at a distance s along the light is as wide as the lamp looks from there, about 2 LAMP_SIZE s."""
-    from pdipc.output.shading import LAMP_SIZE
+    from pdipc.pictures.shading import LAMP_SIZE
 
     widths = []
     for height in (0.25, 0.5):

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pdipc.output import point_cache, usd
-from pdipc.output.paraview import export_paraview
+from pdipc.export import point_cache, usd
+from pdipc.export.paraview import export_paraview
 from pdipc.output.results import Run, RunError
 
 FORMATS = ("usd", "stage", "mdd", "pc2", "ply", "obj", "vtk", "paraview")

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pdipc.bodies.rigid import torn
 from pdipc.device.launch import one_at_a_time
 from pdipc.integration.script import Lead
 from pdipc.model import Model, State
-from pdipc.rigid import torn
 from pdipc.scene.assembly import AssembledBody, AssembledPin
 from pdipc.scene.check import LARGEST, check_placed
 from pdipc.scene.motion import rotation_matrix

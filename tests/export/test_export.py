@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from pdipc.output.export import export
+from pdipc.export.export import export
 from pdipc.output.results import RunError, open_run
 from tests.output import runs
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import pdipc
-from pdipc.output.export import export
+from pdipc.export.export import export
 from pdipc.output.results import open_run
 
 pytest.importorskip("pxr.Usd")
-from tests.output.test_usd import SCENE, SINGLE, make_stage
+from tests.export.test_usd import SCENE, SINGLE, make_stage
 
 BLENDER = sys.executable if importlib.util.find_spec("bpy") else os.environ.get("BPY_PYTHON", "")
 

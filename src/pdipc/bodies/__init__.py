@@ -1,0 +1,1 @@
+"""Each kind of body's part of a model: its constraints and its masses."""

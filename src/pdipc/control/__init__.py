@@ -1,0 +1,1 @@
+"""What changes between steps: commands, and pins that begin and end."""

@@ -1,0 +1,1 @@
+"""Pictures and films of runs and scenes, and plots of audits."""
