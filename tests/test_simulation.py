@@ -145,3 +145,20 @@ def test_sub_steps_are_merged_by_what_their_fields_are():
     record = simulations.stats_of(StepResult(**low))
     assert record.keys() == fields - {"state", "forces"}
     assert record["smallest_gap"] is None
+
+
+def test_what_a_model_was_made_from_refuses_changes_and_the_scene_takes_them():
+    scene = small()
+    simulation = pdipc.Simulation(scene, device="cpu")
+    made = simulation.model.scene
+    assert made == scene and made.model_dump_json() == scene.model_dump_json()
+    for table, name in ((made.contact, "friction"), (made.simulation, "time_step"), (made.bodies[0].material, "density")):
+        with pytest.raises(pdipc.SceneError, match=f"{name} was read when the model was made"):
+            setattr(table, name, 0.5)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        simulation.model.settings.tolerance = 1.0  # pyright: ignore[reportAttributeAccessIssue]
+    scene.contact.friction = 0.5
+    assert pdipc.Simulation(scene, device="cpu").model.scene.contact.friction == 0.5
+    again = made.model_copy(deep=True)
+    again.contact.friction = 0.5
+    assert again == scene

@@ -75,6 +75,18 @@ def step(
     """
     work = work or Work(model)
     _belongs(model, state, work)
+    motions = _solve(model, state, work, observe is not None)
+    report = work.report.numpy().tolist()
+    if report[FOREIGN]:
+        _judge(model, state, work)
+    if observe is not None:
+        for motion in motions:
+            observe(*motion)
+    return _result(model, state, work, report, into)
+
+
+def _solve(model: Model, state: State, work: Work, observed: bool) -> list[tuple[wp.array, wp.array]]:
+    """Takes the step, again from its start whenever a list was full; returns the motions that were committed, where they are observed."""
     work.foreign.zero_()
     model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
     work.set_scripted(state)
@@ -87,7 +99,7 @@ def step(
         wp.copy(work.a_start, state.accelerations)
         wp.copy(work.rest, state.remainders)
         motions = []
-        if observe is None:
+        if not observed:
             work.run(algorithm.time_step)
         else:
             work.run(algorithm.begin)
@@ -96,16 +108,14 @@ def step(
                 work.run(algorithm.outer_iteration)
                 motions.append((begin, wp.clone(work.x)))
             work.run(algorithm.finish)
-        report = work.report.numpy().tolist()
-        if report[status.STATUS] != status.OVERFLOW:
-            break
+        if int(work.report.numpy()[status.STATUS]) != status.OVERFLOW:
+            return motions
         if not work.grow():  # a list was full: with more room, the step is taken again
             raise AssertionError("a list overflowed that had room")
-    if report[FOREIGN]:
-        _judge(model, state, work)
-    if observe is not None:
-        for motion in motions:
-            observe(*motion)
+
+
+def _result(model: Model, state: State, work: Work, report: list[float], into: State | None) -> StepResult:
+    """What the step came to, and its new state."""
     s, code, outer = model.settings, int(report[status.STATUS]), int(report[status.OUTER])
     time, number = state.time + s.time_step, state.step + 1
     reached, lag, why = work.script.settle(time, state.reached, report[FIRST_NUMBER + status.LAG], work.x)

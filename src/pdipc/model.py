@@ -84,7 +84,7 @@ class State:
         }
 
 
-@dataclass
+@dataclass(frozen=True)
 class Settings:
     """How a step is solved: the scene's `simulation` and `contact` tables in metres and seconds."""
 
@@ -103,7 +103,7 @@ class Settings:
     margin: float  # m: how far a vertex may stray from the motion that candidates were listed for
 
 
-@dataclass
+@dataclass(frozen=True)
 class Model:
     """What stays constant: topology, masses, constraints, the global matrix and its solver, the contact surface.
 
@@ -216,7 +216,7 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     refuse(scene, assembly, number.name)
     for note in assembly.notes[told:]:
         warnings.warn(note, SceneWarning, stacklevel=2)
-    return _made(scene, assembly, place, number)
+    return _made(scene.settled(), assembly, place, number)
 
 
 def reassembled(model: Model, assembly: Assembly) -> Model:
@@ -225,34 +225,86 @@ def reassembled(model: Model, assembly: Assembly) -> Model:
 
 
 def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Model:
-    sim = scene.simulation
-    h = sim.time_step / sim.substeps
-    n = len(assembly.positions)
+    settings = _settings(scene, assembly)
+    sim, h, n = scene.simulation, settings.time_step, len(assembly.positions)
     free = np.ones(n, dtype=bool)
     free[assembly.kinematic_vertices] = False
-    nonlinear = _nonlinear_solver(scene)
-    sets, mass = elasticity(assembly, nonlinear == "newton")
+    sets, mass = elasticity(assembly, settings.nonlinear_solver == "newton")
     mass = np.where(free, mass if assembly.masses is None else assembly.masses, 0.0)
-    held = mass * (1.0 / (h * h) + sim.damping / h)
+    inertia = mass * (1.0 / (h * h) + sim.damping / h)
+    held = inertia.copy()
     for s in sets:
         if s.kind == "point_attachment":
             np.add.at(held, s.vertices[:, 0], s.weight)
-    method, truncation = scene.contact.method, scene.contact.truncation
-    if truncation == "auto":
-        truncation = "global" if method == "paper" else "per_vertex"
     solver = None
-    if nonlinear != "newton":
-        matrix = constraints.stiffness_matrix(n, sets) + scipy.sparse.diags_array(mass * (1.0 / (h * h) + sim.damping / h))
-        name = sim.linear_solver
-        if name == "auto":
-            name = DEFAULT_SOLVER["cuda" if place.is_cuda else "cpu"][method]
-        options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
-        if name == "a-jacobi":
-            options["drop"] = sim.solver_drop
-        system = System(place, number, matrix, free)
-        solver = make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
+    if settings.nonlinear_solver != "newton":
+        matrix = constraints.stiffness_matrix(n, sets) + scipy.sparse.diags_array(inertia)
+        solver = _linear_solver(scene, System(place, number, matrix, free))
 
-    per_vertex = {
+    def upload(values: np.ndarray) -> wp.array:
+        return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
+
+    return Model(
+        scene=scene,
+        assembly=assembly,
+        settings=settings,
+        device=place,
+        real=number,
+        substeps=sim.substeps,
+        mass=upload(mass),
+        free=upload(free),
+        **{name: upload(values) for name, values in _per_vertex(scene, assembly, mass, free, h).items()},
+        projector=constraints.Projector(place, number, n, sets),
+        solver=solver,
+        free_vertices=free,
+        held=held,
+        surface=surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle),
+        external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
+        triangles=assembly.triangles,
+        followers=[
+            Follower(b.handles, np.arange(b.first, b.first + b.count), b.weights) for b in assembly.bodies if len(b.handles)
+        ],
+    )
+
+
+def _settings(scene: Scene, assembly: Assembly) -> Settings:
+    sim, contact = scene.simulation, scene.contact
+    h = sim.time_step / sim.substeps
+    truncation = contact.truncation
+    if truncation == "auto":
+        truncation = "global" if contact.method == "paper" else "per_vertex"
+    return Settings(
+        time_step=h,
+        nonlinear_solver=_nonlinear_solver(scene),
+        tolerance=_tolerance(sim, assembly),
+        max_outer=sim.max_outer,
+        inner_iterations=sim.inner_iterations,
+        activation_distance=assembly.activation_distance,
+        slip_threshold=contact.friction_velocity * h,
+        per_vertex_truncation=truncation == "per_vertex",
+        method=contact.method,
+        restitution=contact.restitution,
+        damping=sim.damping,
+        budget_ms=None if sim.budget_ms is None else sim.budget_ms / sim.substeps,
+        margin=0.5 * assembly.activation_distance,
+    )
+
+
+def _linear_solver(scene: Scene, system: System) -> Solver:
+    """Of the constant matrix: the one that the scene names, else what fits the device and the mode."""
+    sim, name = scene.simulation, scene.simulation.linear_solver
+    if name == "auto":
+        name = DEFAULT_SOLVER["cuda" if system.device.is_cuda else "cpu"][scene.contact.method]
+    options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
+    if name == "a-jacobi":
+        options["drop"] = sim.solver_drop
+    return make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
+
+
+def _per_vertex(scene: Scene, assembly: Assembly, mass: np.ndarray, free: np.ndarray, h: float) -> dict[str, np.ndarray]:
+    """What `Model` has for every vertex of its body, by name."""
+    n = len(mass)
+    found = {
         "friction": np.zeros(n),
         "half_separation": np.zeros(n),
         "rest_separation": np.full(n, REST_SEPARATION),
@@ -262,62 +314,18 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
     }
     for body in assembly.bodies:
         own = slice(body.first, body.last)
-        per_vertex["friction"][own] = body.friction
-        per_vertex["half_separation"][own] = body.half_separation
+        found["friction"][own] = body.friction
+        found["half_separation"][own] = body.half_separation
         if body.kind == "rod":
-            per_vertex["rest_separation"][own] = ROD_SEPARATION
+            found["rest_separation"][own] = ROD_SEPARATION
         if not body.kinematic:
             typical = mass[own].sum() / body.count if len(body.handles) else mass[own].mean()
-            per_vertex["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
-            per_vertex["body_mass"][own] = mass[own].sum()
+            found["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
+            found["body_mass"][own] = mass[own].sum()
             crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / speed_of_sound(body.material)
-            per_vertex["rigidity"][own] = h**2 / (h**2 + crossing**2)
-    per_vertex["kappa"][~free] = per_vertex["body_mass"][~free] = 0.0
-
-    def upload(values: np.ndarray) -> wp.array:
-        return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
-
-    skin = surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle)
-    return Model(
-        scene=scene,
-        assembly=assembly,
-        settings=Settings(
-            time_step=h,
-            nonlinear_solver=nonlinear,
-            tolerance=_tolerance(sim, assembly),
-            max_outer=sim.max_outer,
-            inner_iterations=sim.inner_iterations,
-            activation_distance=assembly.activation_distance,
-            slip_threshold=scene.contact.friction_velocity * h,
-            per_vertex_truncation=truncation == "per_vertex",
-            method=method,
-            restitution=scene.contact.restitution,
-            damping=sim.damping,
-            budget_ms=None if sim.budget_ms is None else sim.budget_ms / sim.substeps,
-            margin=0.5 * assembly.activation_distance,
-        ),
-        device=place,
-        real=number,
-        substeps=sim.substeps,
-        mass=upload(mass),
-        free=upload(free),
-        half_separation=upload(per_vertex["half_separation"]),
-        rest_separation=upload(per_vertex["rest_separation"]),
-        friction=upload(per_vertex["friction"]),
-        kappa=upload(per_vertex["kappa"]),
-        body_mass=upload(per_vertex["body_mass"]),
-        rigidity=upload(per_vertex["rigidity"]),
-        projector=constraints.Projector(place, number, n, sets),
-        solver=solver,
-        free_vertices=free,
-        held=held,
-        surface=skin,
-        external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
-        triangles=assembly.triangles,
-        followers=[
-            Follower(b.handles, np.arange(b.first, b.first + b.count), b.weights) for b in assembly.bodies if len(b.handles)
-        ],
-    )
+            found["rigidity"][own] = h**2 / (h**2 + crossing**2)
+    found["kappa"][~free] = found["body_mass"][~free] = 0.0
+    return found
 
 
 def _nonlinear_solver(scene: Scene) -> str:

@@ -21,10 +21,10 @@ def test_first_steps(name):
     if name in NEEDS_USD:
         pytest.importorskip("pxr", reason="needs usd-core (extra: usd)")
     scene = pdipc.load_scene(name)
+    scene.simulation.max_outer = 12
     simulation = pdipc.Simulation(scene, device="cpu")
     simulation.observe = Witness(simulation)
     model = simulation.model
-    model.settings.max_outer = 12
     before = audit(model, simulation.state, simulation.work)
     start = simulation.positions.copy()
     for _ in range(STEPS):

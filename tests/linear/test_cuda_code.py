@@ -1,7 +1,7 @@
 """The CUDA code of all linear kernels compiles, whether or not the machine has a GPU."""
 
 import pytest
-import warp as wp
+from device.machine_code import EVERYTHING, compile_all
 
 from pdipc.device.precision import real
 from pdipc.linear import coarse, kernels, pcg, translations
@@ -21,11 +21,13 @@ FACTORIES = {
 }
 
 
+SAME_SOURCE = {"jacobi", "gauss-seidel"}  # in both precisions: no code of CUDA's own
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", FACTORIES)
 def test_compiles(name, precision, tmp_path):
     """To machine code for one architecture, which also checks the limit on shared memory."""
-    found = vars(FACTORIES[name](real(precision))).values()
-    for module in {kernel.module for kernel in found if isinstance(kernel, wp.Kernel)}:
-        for binary in wp.compile_aot_module(module, arch=86, module_dir=tmp_path, use_ptx=False):
-            assert binary.stat().st_size > 1000
+    if precision == "float64" and name in SAME_SOURCE and not EVERYTHING:
+        pytest.skip("the same source is compiled in float32; set PDIPC_ALL_ARCHITECTURES for both")
+    compile_all(FACTORIES[name](real(precision)), [86], tmp_path)

@@ -454,6 +454,9 @@ def assemble(scene: Scene) -> Assembly:
     return assembly
 
 
+_Part = tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]  # body, table, mesh, start, velocities
+
+
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is found by the check
 def gather(
     scene: Scene, left_out: Iterable[str] = (), numbers: dict[str, list[int]] | None = None
@@ -471,7 +474,38 @@ def gather(
     problems: list[str] = []
     notes: list[str] = []
     unread = set(left_out)  # what refers to these is not judged
-    parts: list[tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]] = []  # body, table, mesh, start, velocities
+    parts = _parts(scene, problems, notes, unread)
+    if all(body.kinematic for body, *_ in parts):
+        return None, problems
+    assembly = _laid_out(scene, parts, notes)
+    numbers = numbers or {}
+    for number, attachment in zip(numbers.get("attachments", itertools.count()), scene.attachments, strict=False):
+        with _noting(problems):
+            if _known(attachment.bodies, unread):
+                _attach(assembly, attachment, f"attachments[{number}]")
+    for number, table in zip(numbers.get("stitches", itertools.count()), scene.stitches, strict=False):
+        with _noting(problems):
+            if _known(table.bodies, unread):
+                _stitch(assembly, table, f"stitches[{number}]")
+    for number, pair in enumerate(scene.contact.quarantine):
+        with _noting(problems):
+            if _known(pair, unread):
+                assembly.quarantine.append(_quarantined(assembly, pair, f"contact.quarantine[{number}]"))
+    for body, placed, *_ in parts:
+        for number, pin in enumerate(placed.pins if isinstance(placed, Body) else []):
+            with _noting(problems):
+                _pin(assembly, body, pin, f'body "{body.name}", pins[{number}]', unread)
+    assembly.velocities[assembly.kinematic_vertices] = 0.0
+    for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
+        with _noting(problems):
+            if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
+                _force(assembly, force, f"forces[{number}]")
+    return assembly, problems
+
+
+def _parts(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[_Part]:
+    """The bodies and obstacles that can be read, copies one by one, with their vertices numbered through."""
+    parts: list[_Part] = []
     first = 0
     for placed, mesh, start, frames in _read_all(scene, problems, notes, unread):
         matrix = rotation_matrix(placed.rotation) * np.broadcast_to(placed.scale, 3)
@@ -527,10 +561,12 @@ def gather(
                 velocities = np.array(placed.velocity) + np.cross(placed.angular_velocity, start - center)
             parts.append((body, placed, Mesh(rest + offset, mesh.triangles, mesh.tets), start + offset, velocities))
             first = body.last
+    return parts
 
+
+def _laid_out(scene: Scene, parts: list[_Part], notes: list[str]) -> Assembly:
+    """All parts together, with the distances that follow from their sizes; nothing is joined or held yet."""
     bodies = [part[0] for part in parts]
-    if all(body.kinematic for body in bodies):
-        return None, problems
     positions = np.concatenate([part[3] for part in parts])
     deformable = positions[: max(body.last for body in bodies if not body.kinematic)]
     scene_size = float(np.linalg.norm(np.ptp(deformable, axis=0)))
@@ -555,29 +591,7 @@ def gather(
             body.half_separation = placed.material.radius
         if isinstance(placed, Obstacle):
             body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
-    numbers = numbers or {}
-    for number, attachment in zip(numbers.get("attachments", itertools.count()), scene.attachments, strict=False):
-        with _noting(problems):
-            if _known(attachment.bodies, unread):
-                _attach(assembly, attachment, f"attachments[{number}]")
-    for number, table in zip(numbers.get("stitches", itertools.count()), scene.stitches, strict=False):
-        with _noting(problems):
-            if _known(table.bodies, unread):
-                _stitch(assembly, table, f"stitches[{number}]")
-    for number, pair in enumerate(scene.contact.quarantine):
-        with _noting(problems):
-            if _known(pair, unread):
-                assembly.quarantine.append(_quarantined(assembly, pair, f"contact.quarantine[{number}]"))
-    for body, placed, *_ in parts:
-        for number, pin in enumerate(placed.pins if isinstance(placed, Body) else []):
-            with _noting(problems):
-                _pin(assembly, body, pin, f'body "{body.name}", pins[{number}]', unread)
-    assembly.velocities[assembly.kinematic_vertices] = 0.0
-    for number, force in zip(numbers.get("forces", itertools.count()), scene.forces, strict=False):
-        with _noting(problems):
-            if _known((force.bodies or []) if isinstance(force, Wind) else [force.body], unread):
-                _force(assembly, force, f"forces[{number}]")
-    return assembly, problems
+    return assembly
 
 
 @contextmanager

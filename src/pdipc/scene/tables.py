@@ -1,6 +1,6 @@
 """What all tables of a scene share: strict numbers, no unknown keys, and SceneError for what is wrong."""
 
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -26,6 +26,8 @@ Index = Annotated[Whole, Field(ge=0)]
 Vector = tuple[Number, Number, Number]
 
 
+SETTLED = "_settled"  # of a table's __dict__ beside its fields, so that neither comparing nor writing sees it
+
 _T = TypeVar("_T")
 
 
@@ -45,7 +47,35 @@ class Table(BaseModel, metaclass=_Model):
     model_config = ConfigDict(extra="forbid", validate_assignment=True, arbitrary_types_allowed=True)
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if SETTLED in self.__dict__:
+            raise SceneError(
+                f"{name} was read when the model was made, and a change would do nothing; change the scene and make a new simulation"
+            )
         try:
             super().__setattr__(name, value)
         except ValidationError as error:
             raise SceneError("\n  ".join(explain(error, {name: value}, type(self)))) from error
+
+    def settled(self) -> Self:
+        """A copy, down to its last table, that refuses changes: what a model was made from. Arrays are shared."""
+        copy = self.model_copy()
+        copy.__dict__.update({name: _settled(value) for name, value in self}, **{SETTLED: True})
+        return copy
+
+    def __copy__(self) -> Self:
+        copy = super().__copy__()
+        copy.__dict__.pop(SETTLED, None)
+        return copy
+
+    def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
+        copy = super().__deepcopy__(memo)
+        copy.__dict__.pop(SETTLED, None)
+        return copy
+
+
+def _settled(value: Any) -> Any:
+    if isinstance(value, Table):
+        return value.settled()
+    if isinstance(value, list):
+        return [_settled(each) for each in value]
+    return value
