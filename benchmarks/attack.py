@@ -22,49 +22,18 @@ from scipy.spatial.transform import Rotation
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(REPOSITORY / "tests"), str(REPOSITORY / "benchmarks")]
 
+import attack_families  # noqa: E402
+from attack_families import Case, ball, block, loose, power, sheet, turn, vector  # noqa: E402
 from ccd import machine  # noqa: E402
 from collision import exact  # noqa: E402
 
 import pdipc  # noqa: E402
 
-STEPS, SECONDS, MOTIONS = 10, 6.0, 60  # of a scene, at most
+STEPS, SECONDS, MOTIONS = 10, 6.0, 60  # of a scene, at most; seconds of work
 SOLVERS = ("auto", "pcg", "two-level", "jacobi", "chebyshev", "matrix-powers", "gauss-seidel", "sor", "direct")
 
 
-# --- what scenes are made of ---
-
-
-def sheet(name: str, side: float = 1.0, cells: int = 4, **more) -> dict:
-    return {"name": name, "kind": "cloth", "mesh": {"shape": "grid", "size": [side, side], "cells": [cells, cells]}, **more}
-
-
-def block(name: str, side: float = 0.3, cells: int = 1, young: float = 1e5, **more) -> dict:
-    mesh = {"shape": "box", "size": [side] * 3, "cells": [cells] * 3}
-    return {"name": name, "kind": "solid", "mesh": mesh, "material": {"young_modulus": young}, **more}
-
-
-def ball(name: str, radius: float, cells: int = 2, **more) -> dict:
-    return {"name": name, "mesh": {"shape": "sphere", "radius": radius, "cells": cells}, **more}
-
-
-def loose(name: str, vertices, triangles, **more) -> dict:
-    return {"name": name, "mesh": {"vertices": np.asarray(vertices, float), "triangles": np.asarray(triangles)}, **more}
-
-
-def power(rng, low: float, high: float) -> float:
-    return float(10.0 ** rng.uniform(low, high))
-
-
-def turn(rng, most: float = 180.0) -> list[float]:
-    return rng.uniform(-most, most, 3).tolist()
-
-
-def vector(rng, size: float) -> list[float]:
-    v = rng.normal(size=3)
-    return (size * v / np.linalg.norm(v)).tolist()
-
-
-# --- families: f(rng) -> (bodies, obstacles, simulation, contact), of which any but the first may be empty ---
+# --- families: f(rng) -> (bodies, obstacles, simulation, contact), of which any but the first may be empty; more in attack_families ---
 
 
 def far_from_origin(rng):
@@ -295,20 +264,23 @@ FAMILIES = (
     spikes,
     aligned_grids,
     whirling_bodies,
+    *attack_families.FAMILIES,
 )
 
 
-def make(family, number: int, seed: int) -> tuple[pdipc.Scene, str]:
-    """Scene `number` of a family, and its settings in words."""
+def make(family, number: int, seed: int) -> tuple[pdipc.Scene, Case, np.random.Generator, str]:
+    """Scene `number` of a family, what is done between its steps, with which numbers, and its settings in words."""
     rng = np.random.default_rng([seed, FAMILIES.index(family), number])
-    bodies, obstacles, simulation, contact = family(rng)
-    method = str(rng.choice(["barrier"] * 4 + ["paper"]))
+    made = family(rng)
+    case = made if isinstance(made, Case) else Case(*made)
+    newton = case.simulation.get("nonlinear_solver") == "newton"  # kinds of bodies that no other method knows
+    method = "barrier" if newton else str(rng.choice(["barrier"] * 4 + ["paper"]))
     common = {
         "precision": str(rng.choice(["float64", "float32"])),
         "max_outer": int(rng.choice([1, 2, 5, 12])),
         "time_step": float(rng.choice([0.001, 0.01, 0.04])),
     }
-    if method == "barrier" and rng.random() < 0.6:
+    if newton or (method == "barrier" and rng.random() < 0.6):
         common |= {"nonlinear_solver": "newton"}
     else:
         common |= {"linear_solver": "a-jacobi" if method == "paper" and rng.random() < 0.5 else str(rng.choice(SOLVERS))}
@@ -318,9 +290,10 @@ def make(family, number: int, seed: int) -> tuple[pdipc.Scene, str]:
         "broad_phase": str(rng.choice(["patches", "bvh"])),
         "truncation": str(rng.choice(["auto", "per_vertex", "global"])),
     }
-    simulation, contact = common | simulation, kept | contact
+    simulation, contact = common | case.simulation, kept | case.contact
     words = " ".join(f"{key}={value}" for key, value in (simulation | contact).items())
-    return pdipc.Scene(bodies=bodies, obstacles=obstacles, simulation=simulation, contact=contact), words
+    tables = {"bodies": case.bodies, "obstacles": case.obstacles, "simulation": simulation, "contact": contact}
+    return pdipc.Scene(**tables, **case.more), case, rng, words
 
 
 # --- the judge ---
@@ -330,20 +303,41 @@ class Judge:
     """Sees every motion that is committed; `breaches` says what went wrong."""
 
     def __init__(self, simulation: pdipc.Simulation):
+        self.watch(simulation)
         triangles, assembly = simulation.triangles, simulation.model.assembly
-        self.obstacle, self.last, self.breaches = assembly.obstacle, simulation.positions.copy(), []
+        self.obstacle, self.owner, self.last, self.breaches = (
+            assembly.obstacle,
+            assembly.body_of_vertex,
+            simulation.positions,
+            [],
+        )
         self.motions = self.pairs = 0
         edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        edges = edges[edges[:, 0] < edges[:, 1]]
         vertices = np.unique(triangles)
+        faces = triangles[triangles[:, 1] != triangles[:, 2]]  # a rod's segment (a, b, b) is an edge
         i, j = np.triu_indices(len(edges), 1)
         self.quads = {
-            "vertex_triangle": np.column_stack([np.repeat(vertices, len(triangles)), np.tile(triangles, (len(vertices), 1))]),
+            "vertex_triangle": np.column_stack([np.repeat(vertices, len(faces)), np.tile(faces, (len(vertices), 1))]),
             "edge_edge": np.column_stack([edges[i], edges[j]]),
         }
         for kind, split in (("vertex_triangle", 1), ("edge_edge", 2)):
             quads = self.quads[kind]
             shared = (quads[:, :split, None] == quads[:, None, split:]).any(axis=(1, 2))
             self.quads[kind] = quads[~shared & ~self.obstacle[quads].all(axis=1)]
+
+    def watch(self, simulation: pdipc.Simulation) -> None:
+        """Goes on with this simulation."""
+        self.simulation = simulation
+        simulation.observe = self
+
+    def excused(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """(k,) bool: which pairs of vertices are of bodies that ignore each other now."""
+        pairs = np.array(self.simulation.model.assembly.quarantine).reshape(-1, 2)[
+            np.array(self.simulation.state.quarantined, dtype=bool)
+        ]
+        owners = np.sort(self.owner[np.column_stack([first, second])], axis=1)
+        return (owners[:, None] == pairs).all(axis=2).any(axis=1)
 
     def __call__(self, begin, end) -> None:
         x, y = begin.numpy().astype(float), end.numpy().astype(float)
@@ -362,6 +356,7 @@ class Judge:
                 near &= low[a, axis].min(axis=1) <= high[b, axis].max(axis=1)
                 near &= high[a, axis].max(axis=1) >= low[b, axis].min(axis=1)
             chosen = quads[near]
+            chosen = chosen[~self.excused(chosen[:, 0], chosen[:, 3])]
             self.pairs += len(chosen)
             if len(chosen):
                 points = np.concatenate([x[chosen], y[chosen]], axis=1)
@@ -369,25 +364,60 @@ class Judge:
                 for quad in chosen[~apart][:3]:
                     self.breaches.append(f"motion {self.motions}: {kind} {quad.tolist()} meets")
 
+    def after(self, step: int) -> None:
+        """Judges the state after a step: intersections, and whether what turns is on its arc (the lemma of `integration.script`)."""
+        simulation, x = self.simulation, self.simulation.positions
+        if not np.array_equal(x, self.last):
+            self.breaches.append(f"step {step} does not end where its last motion ended")
+        meets = pdipc.find_intersections(x, simulation.triangles, self.obstacle)
+        corners = simulation.triangles[meets][:, :, 0]
+        meets = meets[~self.excused(corners[:, 0], corners[:, 1])]
+        if len(meets):
+            self.breaches.append(f"step {step}: triangles {meets[0].tolist()} intersect, of {len(meets)} pairs")
+        script = simulation.work.script
+        for mover in script.movers:
+            lead = script.leads.get(mover.key)
+            if mover.rigid and (lead is None or lead.pose is not None):
+                turned, place = simulation.state.reached.pose(mover)
+                away = turned.apply(mover.points - mover.origin) + place - x[mover.vertices]
+                number = np.finfo(simulation.model.real.numpy)
+                least = 100.0 * float(number.eps) * (np.abs(x[mover.vertices]).max() + np.ptp(mover.points, axis=0).max())
+                own = np.linalg.norm(away, axis=1)[: np.count_nonzero(self.owner == mover.body)]
+                if own.max() > 4.0 * mover.deviation + least:
+                    self.breaches.append(f"step {step}: {mover.label} is {own.max():.3g} m off its arc")
+
 
 def attack(family, number: int, seed: int) -> dict:
     """Runs one scene; what came of it."""
-    scene, words = make(family, number, seed)
+    scene, case, rng, words = make(family, number, seed)
     outcome = {"family": family.__name__, "number": number, "settings": words, "refused": "", "breaches": [], "steps": 0}
     outcome |= {"motions": 0, "pairs": 0, "seconds": 0.0}
-    begun = time.perf_counter()
+    begun, spent = time.perf_counter(), time.process_time()
     try:
         simulation = pdipc.Simulation(scene, "cpu")
     except pdipc.SceneError as error:
         return outcome | {"refused": str(error)}
-    judge = simulation.observe = Judge(simulation)
-    for _ in range(STEPS):
+    judge = Judge(simulation)
+    for step in range(STEPS):
+        if case.act is not None:
+            begin = simulation.positions
+            other = case.act(simulation, rng, step)
+            if other is not None:  # as `attack_families.resumed` does
+                whole, simulation = simulation.positions, other
+                judge.watch(simulation)
+                judge.last = simulation.positions
+                judge.after(step)
+                simulation.step()
+                if not np.array_equal(simulation.positions, whole):
+                    judge.breaches.append(f"step {step}: what goes on from a checkpoint gives other bits")
+                judge.after(step)
+            elif not np.array_equal(begin, simulation.positions):
+                judge.last = simulation.positions  # a new start
+                judge.after(step)
         simulation.step()
         outcome["steps"] += 1
-        meets = pdipc.find_intersections(simulation.positions, simulation.triangles, judge.obstacle)
-        if len(meets):
-            judge.breaches.append(f"step {outcome['steps']}: triangles {meets[0].tolist()} intersect, of {len(meets)} pairs")
-        if judge.breaches or judge.motions >= MOTIONS or time.perf_counter() - begun > SECONDS:
+        judge.after(outcome["steps"])
+        if judge.breaches or judge.motions >= MOTIONS or time.process_time() - spent > SECONDS:
             break
     seconds = time.perf_counter() - begun
     return outcome | {"breaches": judge.breaches, "motions": judge.motions, "pairs": judge.pairs, "seconds": seconds}

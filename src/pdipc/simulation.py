@@ -98,7 +98,7 @@ class Simulation(Controls):
             self.work = Work(model)
             self.work.loads.take_over(before.loads)
             self.work.follow(before.script.leads)
-            wp.copy(self.work.x, self.state.positions)  # what was proven
+            wp.copy(self.work.x, before.x)  # what was proven: a state from elsewhere is judged, whatever pins do
 
     @one_at_a_time
     def reset(self) -> None:

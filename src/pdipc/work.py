@@ -111,7 +111,7 @@ class Work:
     def follow(self, leads: dict[int, Lead]) -> None:
         """These commands, and no others, from the next step on."""
         before = self.script.moves, [vertices[0] for vertices in self.script.rigid()]
-        self.script.leads = leads
+        self.script.follow(leads)
         if before != (self.script.moves, [vertices[0] for vertices in self.script.rigid()]):
             self.truncation.keep_rigid(self.script.rigid())
             self.script.generation += 1

@@ -239,3 +239,23 @@ def test_the_page_on_commands_runs_as_it_stands():
     assert blocks
     for block in blocks:
         exec(compile(block, "control.md", "exec"), {})
+
+
+def test_a_reset_and_an_earlier_state_take_commands_back():
+    """What a command led goes back to its script, also where that never moves it; it went on to where it had been told to go."""
+    scene = pdipc.Scene(
+        simulation={"gravity": [0, 0, 0]},
+        bodies=[{"name": "cloth", "kind": "cloth", "mesh": {"shape": "grid", "cells": [2, 2]}, "translation": [0, 1, 0]}],
+        obstacles=[box("box", [0.2] * 3, [0, 0, 0])],
+    )
+    simulation = pdipc.Simulation(scene, "cpu")
+    simulation.step()
+    start, earlier = simulation.positions[9:], simulation.checkpoint()
+    for back in (simulation.reset, lambda: simulation.restore(earlier)):
+        simulation.set_pose("box", (0, -1, 0), speed=10.0)
+        for _ in range(2):
+            simulation.step()
+        assert np.allclose(simulation.positions[9:], start - [0, 0.2, 0])
+        back()
+        simulation.step()
+        assert np.array_equal(simulation.positions[9:], start) and np.allclose(simulation.pose("box")[0], 0.0)

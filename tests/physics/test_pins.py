@@ -225,3 +225,20 @@ def test_commands_to_pins_that_began_later_go_on_to_the_same_bits():
     ends = [each.checkpoint() for each in (whole, again)]
     assert all(np.array_equal(ends[0][name], ends[1][name]) for name in ends[0])
     assert not np.array_equal(ends[0]["caught_1_points"], ends[0]["reached_anchors"]), "it was led on"
+
+
+def test_what_is_glued_to_a_rigid_obstacle_moves_with_it_where_a_command_deforms_it():
+    """At the start or later: a rigid obstacle becomes one that deforms."""
+    pins = [{"select": {"vertices": [0]}, "follow": "box"}, {"select": {"vertices": [8]}, "follow": "box", "start": 0.02}]
+    sheet = cloth("sheet", [0.3, 0.3], [2, 2], at=(0, 0.3, 0), pins=pins)
+    simulation = pdipc.Simulation(scene([sheet], [box()], gravity=[0, 0, 0]), "cpu")
+    shift = np.array([0.01, 0.02, 0.0])
+    held = simulation.positions[0]
+    for _ in range(2):
+        simulation.set_vertices("box", simulation.positions[9:] + shift, speed=10.0)
+        simulation.step()
+    assert np.allclose(simulation.positions[0], held + 2 * shift)
+    caught = simulation.positions[8]
+    simulation.set_vertices("box", simulation.positions[9:] + shift, speed=10.0)
+    simulation.step()
+    assert np.allclose(simulation.positions[[0, 8]], [held + 3 * shift, caught + shift])

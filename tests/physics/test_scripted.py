@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pdipc
+from pdipc.scene.check import check
 from physics.scenes import cloth, floor, scene, watched
 
 
@@ -61,3 +62,29 @@ def test_a_cloth_hangs_from_a_moving_obstacle_by_springs():
     assert all(sim.step().converged for _ in range(40))
     assert 0.1 < sim.positions[:25, 0].mean() < 0.25, "it follows the bar, which has gone 0.2 m"
     assert -0.2 < sim.positions[:25, 1].mean() < 0.0, "and hangs below it"
+
+
+@pytest.mark.parametrize("method", ["newton", "local-global"])
+def test_frames_within_a_step_are_followed(method):
+    """A plate that is below the cloth at each step and above it in between does not pass it, but pushes it and is late."""
+    low, high = (np.array([[-1, y, -1], [1, y, -1], [-1, y, 1], [1, y, 1.0]]) for y in (-0.05, 0.05))
+    cache = {"vertices": np.array([low, high, low, high, low]), "times": [0.0, 0.005, 0.01, 0.015, 0.02]}
+    plate = {"name": "plate", "mesh": {"vertices": low, "triangles": [[0, 2, 1], [1, 2, 3]]}, "motion": {"cache": cache}}
+    sheet = cloth("sheet", [0.4, 0.4], [2, 2])
+    made = scene([sheet], [plate], contact={"activation_distance": 2e-3}, nonlinear_solver=method, gravity=[0, 0, 0])
+    simulation, highest = pdipc.Simulation(made, "cpu"), []
+    simulation.observe = lambda x, x_end: highest.append(x_end.numpy()[:, 1])
+    for _ in range(2):
+        assert simulation.step().chords == 2
+    heights = np.array(highest)
+    assert heights[:, 9:].max() > 0.04 and np.all(heights[:, :9].min(axis=1) > heights[:, 9:].max(axis=1))
+    assert np.allclose(simulation.positions[9:], low)
+
+
+def test_more_frames_in_a_step_than_can_be_followed_are_refused():
+    vertices, triangles = np.array([[-1, 0, -1], [1, 0, -1], [-1, 0, 1.0]]), [[0, 2, 1]]
+    cache = {"vertices": np.tile(vertices, (9000, 1, 1)), "times": (np.arange(9000) * 1e-6).tolist()}
+    plate = {"name": "plate", "mesh": {"vertices": vertices, "triangles": triangles}, "motion": {"cache": cache}}
+    made = scene([cloth("sheet", [0.4, 0.4], [2, 2], at=(0, 1, 0))], [plate], time_step=0.005)
+    (finding,) = check(made)
+    assert "has 5000 keyframes or frames within a step" in str(finding)

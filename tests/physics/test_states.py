@@ -93,3 +93,35 @@ def test_states_and_buffers_of_other_models_are_refused():
     with pytest.raises(ValueError, match=r"are \(80,\) of float32; those of the model are \(80,\) of float64"):
         step(made.model, single.state, made.work)
     assert step(made.model, made.state, Work(made.model)).converged
+
+
+def test_a_state_is_judged_also_where_a_pin_begins():
+    """The buffers are made anew there; what they began with went unjudged."""
+    pin = {"select": {"vertices": [0]}, "start": 0.02}
+    bodies = [
+        solid("block", [0.1] * 3, [1, 1, 1], at=(0, 0.1, 0)),
+        cloth("sheet", [0.3, 0.3], [3, 3], at=(0, 0.3, 0), pins=[pin]),
+    ]
+    made = pdipc.Simulation(scene(bodies, contact={"activation_distance": 1e-3}), "cpu")
+    for _ in range(2):
+        made.step()
+    write(made, "positions", lambda x: x[8:].__setitem__((slice(None), 1), 0.1))
+    with pytest.raises(ValueError, match="triangles that intersect"):
+        made.step()
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_step_that_cannot_move_ends_where_it_began(precision):
+    """x + remainder is x to the bit, or the remainder is forgotten: a state from outside has one of other positions."""
+    made = pdipc.Simulation(scene([cloth("sheet", [0.3, 0.3], [2, 2])], precision=precision), "cpu")
+    x = made.state.positions.numpy()
+    rest = 0.4 * np.spacing(x)
+    rest[0] = 0.6 * np.spacing(x[0])  # more than a half: the sum rounds away
+    rest[1], rest[2] = 3.0, -1e-3
+    made.state.remainders.assign(rest)
+    work = made.work
+    for to, values in ((work.x, x), (work.rest, rest), (work.x_start, x)):
+        to.assign(values)
+    work.predict()
+    u = work.u.numpy()
+    assert np.array_equal(x + u, x) and np.array_equal(u[3:], rest[3:]) and not u[1:3].any()

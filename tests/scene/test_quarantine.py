@@ -105,3 +105,16 @@ def test_runs_say_so_and_go_on_after_a_stop(tmp_path):
     certificate = CliRunner().invoke(app, ["certify", str(tmp_path / "whole")])
     assert certificate.exit_code == 0, certificate.stdout
     assert "quarantined" in certificate.stdout and "not judged, not certified" in certificate.stdout
+
+
+@pytest.mark.filterwarnings("ignore::pdipc.scene.errors.SceneWarning")
+def test_what_has_parted_cannot_be_put_into_each_other_again():
+    simulation = pdipc.Simulation(parting(), "cpu")
+    start = simulation.positions[:27]
+    while simulation.state.quarantined[0]:
+        simulation.set_positions("left", start)  # as long as they ignore each other it may
+        simulation.step()
+    before = simulation.positions
+    with pytest.raises(ValueError, match=r'"left" and body "right": .* intersect'):
+        simulation.set_positions("left", start + np.array([0.3, 0, 0]))
+    assert np.array_equal(simulation.positions, before)

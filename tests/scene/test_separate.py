@@ -13,6 +13,7 @@ from pdipc.scene.check import check
 from pdipc.scene.distances import closest_on_segments, closest_on_triangles, winding_numbers
 from pdipc.scene.errors import SceneWarning
 from pdipc.scene.generators import Grid
+from pdipc.scene.repair import repaired
 from pdipc.scene.separate import separate
 
 
@@ -195,3 +196,14 @@ def test_check_scene_draws_and_repairs(tmp_path):
         pixels = imageio.imread(picture)[..., :3].astype(int)
         reds.append(int(((pixels[..., 0] > 120) & (pixels[..., 1:].max(axis=-1) < 70)).sum()))
     assert reds[0] > 1000 and reds[1] == 0
+
+
+def test_a_scene_with_a_rigid_body_is_repaired():
+    box = {"shape": "box", "size": [0.3, 0.3, 0.3], "cells": [1, 1, 1]}
+    rigid = {"name": "rigid", "kind": "rigid", "mesh": box, "rotation": [0, 30, 0], "velocity": [0, 1, 0]}
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 5.0}, "translation": [0, -0.1, 0]}
+    made, notes, left = repaired(pdipc.Scene(bodies=[rigid], obstacles=[floor]))
+    assert len(notes) == 1 and not left
+    simulation = pdipc.Simulation(made, "cpu")
+    assert 0.05 < simulation.positions[:8, 1].mean() < 0.08
+    assert simulation.step().converged

@@ -10,7 +10,8 @@ positions that are committed, and CCD was asked about just these. A pair that ha
 is listed; a pair without one makes the motion of the first pass, where it was not hit, or some of its vertices would be shortened; it was
 listed there, or proven apart all the way. A pair that is not listed is apart by the lemmas of `candidates`, since the list was made for
 this motion or one that `check` compared with it. Whatever shortens a vertex (a pair's time, its neighbours, a line search that begins at a
-later pass) leaves a fraction below 1. Where the passes do not settle nobody moves: x_end = base + u, which is x to the bit, and feasible.
+later pass) leaves a fraction below 1. Where the passes do not settle nobody moves: x_end = base + u, which is x to the bit (a step begins so, `inertia.predict`, and every motion
+that is made ends so), and feasible.
 Times only choose what to try: no rounding in them, in fractions or in base + u + f (u~ - u) matters.
 
 The paper truncates every vertex by the one smallest time (`per_vertex=False`): correct, but one collision anywhere then

@@ -129,6 +129,8 @@ class Controls:
     def set_positions_of(self, positions: dict[str, Any]) -> None:
         """As `set_positions` for several bodies, by name, at once: what one of them leaves is free for another."""
         assembly, precision = self.model.assembly, self.model.real.name
+        still = [pair for pair, is_one in zip(assembly.quarantine, self.state.quarantined, strict=True) if is_one]
+        assembly = replace(assembly, quarantine=still)  # what has parted ignores each other no more
         x = self.state.positions.numpy().copy()
         before, put = x.copy(), np.zeros(len(x), dtype=bool)
         for body, wanted in positions.items():

@@ -45,13 +45,13 @@ def _catch(assembly: Assembly, pin: AssembledPin, number: int, state: State) -> 
     if pin.follow < 0:
         rotation, p = pin.trajectory.pose(state.time)
         return {f"{number}_points": pulled_back(points, rotation, pin.trajectory.center + p, pin.trajectory.center)}
-    if not isinstance(assembly.bodies[pin.follow].trajectory, Trajectory):
-        glue = assembly.glued(pin, x)
-        parts = {"triangles": glue.triangles, "weights": glue.weights, "offsets": glue.offsets}
-        return {f"{number}_points": points} | {f"{number}_{name}": values for name, values in parts.items()}
-    mover = next(mover for mover in movers_of(assembly) if mover.body == pin.follow)
-    turn, place = state.reached.pose(mover)
-    return {f"{number}_points": pulled_back(points, turn.as_matrix(), place, mover.origin)}
+    glue = assembly.glued(pin, x)
+    parts = {"triangles": glue.triangles, "weights": glue.weights, "offsets": glue.offsets}
+    if isinstance(assembly.bodies[pin.follow].trajectory, Trajectory):
+        mover = next(mover for mover in movers_of(assembly) if mover.body == pin.follow)
+        turn, place = state.reached.pose(mover)
+        points = pulled_back(points, turn.as_matrix(), place, mover.origin)
+    return {f"{number}_points": points} | {f"{number}_{name}": values for name, values in parts.items()}
 
 
 def _caught(pin: AssembledPin, number: int, caught: dict[str, np.ndarray]) -> AssembledPin:

@@ -50,10 +50,16 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Lines 1 and 2 as displacements: z - x* = h v* + h^2 M^-1 f_ext, x~ - x* = h v* + h^2/4 a*. Kinematic vertices: their target.
 
-        rest: what rounding took off the position x* when it was stored.
+        rest: what rounding took off the position x* when it was stored; nothing where x* + rest is not x* to the bit, as after a change of
+        positions from outside: where no motion is proven a step ends at x* + rest (`collision.truncation`).
         """
         i = first + wp.tid()
-        u_out[i] = rest[i]
+        own = rest[i]
+        for axis in range(3):
+            if x[i][axis] + own[axis] != x[i][axis]:
+                own[axis] = scalar(0.0)
+        rest[i] = own
+        u_out[i] = own
         if free[i] > scalar(0.0):
             inertial = rest[i] + h * v[i]
             z_out[i] = inertial + h * h * acceleration[i]

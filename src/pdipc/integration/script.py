@@ -74,11 +74,17 @@ def kernels(real: Real) -> SimpleNamespace:
         turns: wp.array(dtype=wp.mat33d),
         places: wp.array(dtype=wp.vec3d),
         parts: wp.array(dtype=wp.float64),
+        bends: wp.array(dtype=wp.int32),
+        bend_offset: wp.array(dtype=wp.int32),
+        size: wp.array(dtype=wp.int32),
+        corners: wp.array(dtype=vec3),
         x_start: wp.array(dtype=vec3),
         goal: wp.array(dtype=vec3),
         target_out: wp.array(dtype=vec3),
     ):
-        """The waypoint that each member goes to now."""
+        """The waypoint that each member goes to now: on an arc, or on the pieces from corner to corner of a way that bends, of which
+        parts has the number and, after the point, how much of it.
+        """
         k = first + wp.tid()
         i = members[k]
         m = mover[i]
@@ -86,7 +92,14 @@ def kernels(real: Real) -> SimpleNamespace:
         target_out[i] = goal[i]
         if at[m] < count[m]:
             if straight[m] != 0:
-                target_out[i] = x_start[i] + scalar(parts[slot]) * (goal[i] - x_start[i])
+                piece = int(wp.floor(parts[slot]))
+                a = x_start[i]
+                b = goal[i]
+                if piece > 0:
+                    a = corners[bend_offset[m] + (piece - 1) * size[m] + k]
+                if piece < bends[m]:
+                    b = corners[bend_offset[m] + piece * size[m] + k]
+                target_out[i] = a + scalar(parts[slot] - wp.float64(piece)) * (b - a)
             else:
                 x = turns[slot] * (points[k] - center[m]) + places[slot]
                 target_out[i] = vec3(scalar(x[0]), scalar(x[1]), scalar(x[2]))
@@ -273,12 +286,8 @@ class Script:
         self.goal, self.target = zeros(real.vec3, n), zeros(real.vec3, n)
         self.at, self.tries, self.drive, self.crowded, self.behind = (zeros(wp.int32) for _ in range(5))
         self.left, self.flags, self.chords = zeros(real.scalar), zeros(wp.int32, 3), zeros(wp.int32, 1)
-        self.count, self.offset, self.straight, self.center = (
-            zeros(wp.int32),
-            zeros(wp.int32),
-            zeros(wp.int32),
-            zeros(wp.vec3d),
-        )
+        self.count, self.offset, self.straight, self.bends, self.bend_offset = (zeros(wp.int32) for _ in range(5))
+        self.center = zeros(wp.vec3d)
         owner = np.full(n, -1, dtype=np.int32)
         for number, mover in enumerate(self.movers):
             owner[mover.vertices] = number
@@ -288,8 +297,11 @@ class Script:
         self.mover, self.members = upload(owner, wp.int32), upload(np.append(members, 0).astype(np.int32), wp.int32)
         self.points = upload(np.append(points, np.zeros((1, 3)), axis=0), wp.vec3d)
         self.leaders = upload(np.array([mover.vertices[0] for mover in self.movers] or [0], dtype=np.int32), wp.int32)
+        sizes = [len(mover.vertices) for mover in self.movers]
+        self.size, self._first = upload(np.array(sizes or [0], dtype=np.int32), wp.int32), np.cumsum([0, *sizes])
         self._where = assembly.positions.copy()  # the goal on the host
         self._uploaded = False
+        self.corners = zeros(real.vec3, 1)
         self._room(16)
 
     def _room(self, size: int) -> None:
@@ -302,6 +314,10 @@ class Script:
     def moves(self) -> bool:
         """Whether anything leaves its place."""
         return any(mover.key in self.leads or not mover.still for mover in self.movers)
+
+    def follow(self, leads: dict[int, Lead]) -> None:
+        """These commands, and no others: what followed one goes back to its script, also where that never moves it."""
+        self.leads, self._uploaded = leads, False
 
     def commands(self) -> dict[str, np.ndarray]:
         """The commands as arrays by name; see `leads_of`."""
@@ -356,8 +372,7 @@ class Script:
                 shared += [] if mover.still else [number]
             self._ways.append(way)
         if shared:
-            turning = [(m, m.trajectory) for m in map(self.movers.__getitem__, shared) if isinstance(m.trajectory, Trajectory)]
-            times = _waypoints(turning, time, end)
+            times = _waypoints([(m, m.trajectory) for m in map(self.movers.__getitem__, shared)], time, end)
             for number in shared:
                 self._ways[number].times = times
         self._upload()
@@ -397,28 +412,41 @@ class Script:
             self._room(2 * int(offsets[-1]))
         turns, places, parts = np.zeros((offsets[-1], 3, 3)), np.zeros((offsets[-1], 3)), np.zeros(offsets[-1])
         centers, straight = np.zeros((len(counts), 3)), np.ones(len(counts), dtype=np.int32)
+        bends, bend_offsets, corners = np.zeros(len(counts)), np.zeros(len(counts)), [np.zeros((0, 3))]
         for number, (mover, way) in enumerate(zip(self.movers, self._ways, strict=True)):
             own = slice(offsets[number], offsets[number] + counts[number])
             if way.path is None:
                 continue
             if way.path.is_rigid:
                 self._where[mover.vertices] = way.path.apply(mover.points, way.times[-1])
-            else:
-                self._where[mover.vertices] = mover.place(way.times[-1])
-            parts[own] = (way.times - way.start) / max(way.times[-1] - way.start, 1e-300)
-            if way.path.is_rigid and counts[number] > 1:
-                straight[number], centers[number] = 0, way.path.center
-                poses = [way.path.pose(time) for time in way.times]
-                turns[own], places[own] = [pose[0] for pose in poses], [way.path.center + pose[1] for pose in poses]
+                if counts[number] > 1:
+                    straight[number], centers[number] = 0, way.path.center
+                    poses = [way.path.pose(time) for time in way.times]
+                    turns[own], places[own] = [pose[0] for pose in poses], [way.path.center + pose[1] for pose in poses]
+                continue
+            self._where[mover.vertices] = mover.place(way.times[-1])
+            inner = way.path.breaks[(way.start < way.path.breaks) & (way.path.breaks < way.times[-1])]
+            parts[own] = np.interp(way.times, [way.start, *inner, way.times[-1]], np.arange(len(inner) + 2.0))
+            bends[number], bend_offsets[number] = len(inner), sum(map(len, corners)) - self._first[number]
+            corners += [mover.place(time) for time in inner]
         self.goal.assign(self._where.astype(self.real.numpy))
         if counts:
-            for array, values in ((self.count, counts), (self.offset, offsets[:-1]), (self.straight, straight)):
+            numbers = (self.count, counts), (self.offset, offsets[:-1]), (self.straight, straight)
+            for array, values in (*numbers, (self.bends, bends), (self.bend_offset, bend_offsets)):
                 array.assign(np.asarray(values, dtype=np.int32))
             self.center.assign(centers)
+            self._upload_corners(np.concatenate(corners))
         if offsets[-1] > len(counts):  # else each goes to its goal at once
             for array, values in ((self.turns, turns), (self.places, places), (self.parts, parts)):
                 array[: offsets[-1]].assign(values)
         self._uploaded = True
+
+    def _upload_corners(self, corners: np.ndarray) -> None:
+        if len(corners) > len(self.corners):
+            self.corners = wp.zeros(2 * len(corners), dtype=self.real.vec3, device=self.device.warp)
+            self.generation += 1
+        if len(corners):
+            self.corners[: len(corners)].assign(corners.astype(self.real.numpy))
 
     def settle(self, time: float, reached: Reached, lag: float, positions: wp.array) -> tuple[Reached, float, str]:
         """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and
@@ -464,7 +492,8 @@ class Script:
 
     def _aim(self, x_start: wp.array) -> None:
         table = [self.count, self.offset, self.straight, self.center, self.turns, self.places, self.parts]
-        inputs = [self.members, self.mover, self.points, self.at, *table, x_start, self.goal, self.target]
+        corners = [self.bends, self.bend_offset, self.size, self.corners]
+        inputs = [self.members, self.mover, self.points, self.at, *table, *corners, x_start, self.goal, self.target]
         self.device.launch(self.kernels.aim, self.member_count, inputs)
 
     def advance(self, x_start: wp.array, u: wp.array, fraction: wp.array) -> None:
@@ -488,7 +517,8 @@ def _towards(now: np.ndarray, goal: np.ndarray, within: float) -> np.ndarray:
 def _waypoints(paths: list, first: float, last: float) -> np.ndarray:
     """(k,) times, ascending to `last`, between which each of the paths, with its mover, is straight, or turns by no more than it may."""
     least = 1e-9 * (last - first)
-    breaks = [t for _, path in paths for t in path.breaks if first + least < t < last - least]
+    breaks = np.concatenate([path.breaks for _, path in paths])
+    breaks = breaks[(first + least < breaks) & (breaks < last - least)]
     times = []
     for a, b in itertools.pairwise(np.unique([first, *breaks, last])):
         count = max([1, *(mover.chords(path, a, b) for mover, path in paths)])

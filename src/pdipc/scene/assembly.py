@@ -294,7 +294,7 @@ class Assembly:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         path = pin.trajectory if pin.follow < 0 else self.bodies[pin.follow].trajectory
         assert path is not None
-        return path.apply(pin.points, time) if pin.glue is None else pin.glue.apply(path.apply(None, time))
+        return path.apply(pin.points, time) if path.is_rigid or pin.glue is None else pin.glue.apply(path.apply(None, time))
 
     def glued(self, pin: AssembledPin, x: np.ndarray) -> Glue:
         """How a pin's vertices move with the surface that it follows, from where both are at positions x (n, 3) m."""
@@ -784,7 +784,7 @@ def _pin(assembly: Assembly, body: AssembledBody, table: Pin, where: str, unread
             return  # the check says so
         if table.stiffness is not None:
             pin.elements, pin.weights = _onto(assembly.positions, body, surface, vertices)
-        elif isinstance(surface.trajectory, Deforming) and len(vertices):
+        elif len(vertices):
             pin.glue = assembly.glued(pin, assembly.positions)
     assembly.pins.append(pin)
 

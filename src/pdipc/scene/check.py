@@ -17,7 +17,7 @@ from pdipc.scene.errors import SceneError
 from pdipc.scene.finding import Finding
 from pdipc.scene.load import RightPart, load_right_part
 from pdipc.scene.motion import Trajectory
-from pdipc.scene.movers import MOST, most_chords, movers_of
+from pdipc.scene.movers import MOST, most_chords, most_corners, movers_of
 from pdipc.scene.quarantine import Quarantine
 from pdipc.scene.reach import hints
 from pdipc.scene.schema import Cloth, Rigid, Rod, Scene, local_global_settings, uses_newton
@@ -381,7 +381,7 @@ def _motions(assembly: Assembly) -> Iterator[Finding]:
 
 
 def _turns(scene: Scene, assembly: Assembly) -> Iterator[Finding]:
-    """What turns so fast that its arcs cannot be followed."""
+    """What turns so fast, or so often, that its way cannot be followed."""
     h = scene.simulation.time_step / scene.simulation.substeps
     for mover in movers_of(assembly):
         chords = most_chords(mover, h)
@@ -394,6 +394,11 @@ def _turns(scene: Scene, assembly: Assembly) -> Iterator[Finding]:
             )
             right = f"they must be at most {MOST}: take a shorter time_step or more substeps"
             yield Finding(mover.label, found, right + (", or a larger minimum separation" if mover.body >= 0 else ""))
+        if (corners := most_corners(mover, h)) > MOST:
+            found = f"has {corners} keyframes or frames within a step of {h:g} s, each of which is followed"
+            yield Finding(
+                mover.label, found, f"they must be at most {MOST}: leave some out, or take a shorter time_step or more substeps"
+            )
 
 
 def _activation(assembly: Assembly, precision: str) -> Iterator[Finding]:

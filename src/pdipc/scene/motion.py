@@ -122,6 +122,11 @@ class Deforming:
         self.frames, self.begin, self.matrix, self.translation = frames, begin, matrix, translation
 
     @property
+    def breaks(self) -> np.ndarray:
+        """(k,) s: when its vertices change their directions: at its frames."""
+        return self.frames.times + self.begin
+
+    @property
     def is_static(self) -> bool:
         """Whether all frames are alike."""
         points = self.frames.points

@@ -9,7 +9,7 @@ from pdipc.scene.assembly import AssembledPin, Assembly
 from pdipc.scene.motion import Approach, Deforming, Trajectory
 
 CHORD = 0.2  # of the least separation of an obstacle's pairs: how far its chords may be from their arcs (`integration.script`)
-MOST = 4096  # chords of a step
+MOST = 4096  # chords of a step, and corners
 
 
 @dataclass
@@ -60,8 +60,10 @@ class Mover:
         """m: of the farthest point from the center of the path's turns."""
         return float(np.linalg.norm(self.points - path.center, axis=1).max(initial=0.0))
 
-    def chords(self, path: Trajectory | Approach, first: float, last: float) -> int:
+    def chords(self, path: Trajectory | Deforming | Approach, first: float, last: float) -> int:
         """How many chords a turn between two times needs, with no break in between (`scene.motion`)."""
+        if isinstance(path, Deforming):
+            return 1
         angle = (last - first) * path.turning(first, last)
         return max(1, int(np.ceil(angle * np.sqrt(self.reach(path) / (8.0 * self.deviation)))))
 
@@ -93,3 +95,9 @@ def most_chords(mover: Mover, h: float) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         needed = np.ceil(h * mover.trajectory.fastest() * np.sqrt(mover.reach(mover.trajectory) / (8.0 * mover.deviation)))
     return max(1.0, float(needed)) if np.isfinite(mover.points).all() else 1.0
+
+
+def most_corners(mover: Mover, h: float) -> int:
+    """The most corners of its way, keyframes or frames, within any step of h, s."""
+    times = np.sort(mover.trajectory.breaks)
+    return int((np.searchsorted(times, times + h) - np.arange(len(times))).max(initial=0))
