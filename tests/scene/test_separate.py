@@ -118,6 +118,30 @@ def test_the_folds_of_one_cloth_that_cut_through_each_other():
     assert done.crossings > 0
 
 
+@pytest.mark.parametrize("degrees", [2, 8, 12])
+def test_sheets_that_cross_along_a_line_through_both(degrees):
+    sheets = [
+        cloth("a", (0.4, 0.4), (12, 12)),
+        cloth("b", (0.4, 0.4), (12, 12), at=(0.003, 0, 0.002), rotation=(0, 3, degrees)),
+    ]
+    _, done = judged(scene(sheets))
+    most = 0.2 * np.sin(np.deg2rad(degrees))  # half of a sheet is so deep, at most, and both give way
+    assert done.crossings > 40 and max(done.moved.values()) < most + 0.01
+
+
+@pytest.mark.parametrize("degrees", [3, 8])
+def test_sheets_that_cross_along_a_line_that_ends_within_both(degrees):
+    other = cloth("b", (0.4, 0.4), (12, 12), at=(0.15, 0.001, 0.2), rotation=(degrees, 5, degrees))
+    _, done = judged(scene([cloth("a", (0.4, 0.4), (12, 12)), other]))
+    assert done.crossings > 20 and max(done.moved.values()) < 0.04
+
+
+def test_sheets_across_each_other_are_left_and_named():
+    crossed = assemble(scene([cloth("a", (0.4, 0.4), (8, 8)), cloth("b", (0.4, 0.4), (8, 8), rotation=(0, 3, 90))]))
+    done = separate(crossed)
+    assert done.left == [("a", "b")]  # more than `limit` away from one side, whichever it is
+
+
 def test_a_skirt_that_starts_in_a_body():
     """Real meshes: a body of eight parts that intersect each other, with holes."""
     skirt, body = np.load(data.path("meshes/cloth/skirt_16k.npz")), np.load(data.path("meshes/cloth/mannequin_25k.npz"))

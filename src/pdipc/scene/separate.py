@@ -3,7 +3,9 @@
 Which side is the right one? An edge that crosses a surface cuts the mesh graph of its own. Where the surface that is crossed encloses space, the parts
 that lie inside are on the wrong side (generalized winding number, Jacobson et al. 2013: it may have holes). Where it is open, as cloth is, the largest
 part is on the right side and all others are not (global intersection analysis, Baraff et al. 2003). An edge that cuts nothing off has its nearer end on
-the wrong side. A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as
+the wrong side. Where that does not separate open surfaces, as where sheets cross along a line, so that neither half is wrong more than the other, or along a line
+that ends within both, which cuts nothing off, they are tried again by their *order*: one sheet is to lie wholly on one side of the other, the one that is
+reached with less motion, and what is over the other on the other side is wrong. A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as
 it may: obstacles and what pins hold exactly do not, solids as a whole first, each other vertex by itself, and displacements spread to its neighbours so
 that elements are strained little.
 
@@ -32,6 +34,7 @@ SOLID_WEIGHT = 0.1  # how readily a solid moves, beside cloth
 NEAREST = 12  # triangles of which the nearest is looked for, by their middles
 SPREAD = 0.5  # how much of its neighbours' displacement a vertex takes over in a round
 HURRY = 1.5  # times the mean of what a solid's vertices ask for: the deepest ask for more than the mean
+OVER = 0.5  # cosine to the normal of a surface from which on a vertex is over it, not beside it
 NEAR = 1.2  # of the minimum separation: pairs that start nearer are put apart, too
 
 
@@ -59,13 +62,21 @@ def separate(assembly: Assembly, limit: float | None = None) -> Separation:
     """Moves what is not held until nothing of `assembly` intersects and all pairs of bodies keep their minimum separation, by at most
     `limit` m a vertex; None: a part of the largest body's size. The assembly stays as it is.
     """
-    return _Separator(assembly, LIMIT * assembly.body_sizes[1] if limit is None else limit).run()
+    limit = LIMIT * assembly.body_sizes[1] if limit is None else limit
+    found = _Separator(assembly, limit).run()
+    if found.left and (again := _Separator(assembly, limit, by_order=True)).orders:
+        ordered = again.run()
+        return min(found, ordered, key=lambda each: len(each.left))
+    return found
 
 
 class _Separator:
-    """x: (n, 3) m, where the vertices are now. weight: (n,) how readily each moves. pushed: (n,) bool, whether it was ever pushed."""
+    """x: (n, 3) m, where the vertices are now. weight: (n,) how readily each moves. pushed: (n,) bool, whether it was ever pushed.
 
-    def __init__(self, assembly: Assembly, limit: float):
+    orders: of pairs of open surfaces that cross, on which side of the second the first is to be, 1 or -1; empty unless `by_order`.
+    """
+
+    def __init__(self, assembly: Assembly, limit: float, by_order: bool = False):
         self.assembly, self.limit = assembly, limit
         self.x = assembly.positions.copy()
         self.triangles = assembly.triangles
@@ -83,6 +94,12 @@ class _Separator:
         self.encloses = [encloses(assembly.positions, body.triangles) for body in assembly.bodies]
         self.mean = _neighbour_mean(assembly)
         self.pushed = np.zeros(len(self.x), dtype=bool)
+        self.orders: dict[tuple[int, int], float] = {}
+        if by_order:
+            crossings = self._crossings()
+            for a, b in np.unique(np.sort(self._owners(crossings), axis=1), axis=0):
+                if a != b and not (self.encloses[a] or self.encloses[b]):
+                    self._order(a, b)
 
     def run(self) -> Separation:
         crossings = self._crossings()
@@ -133,11 +150,17 @@ class _Separator:
 
     def _through(self, crossings: np.ndarray) -> tuple[np.ndarray, ...]:
         """Pushes of vertices on the wrong side through the surface that they are behind; see `_apply`."""
-        owners = np.column_stack([self.owner[self.edges[crossings[:, 0], 0]], self.owner[self.triangles[crossings[:, 1], 0]]])
+        owners = self._owners(crossings)
         pushes = []
         settled = np.zeros(len(crossings), dtype=bool)
         for a, b in np.unique(owners, axis=0):
             own = np.flatnonzero(np.all(owners == (a, b), axis=1))
+            if (a, b) in self.orders:
+                _, height, push = self._over(a, b)
+                wrong = height * self.orders[a, b] < 0.0
+                pushes += [tuple(each[wrong] for each in push), self._wrong_ends(crossings[own], self.orders[a, b])]
+                settled[own] = True
+                continue
             part = self._wrong(a, b, crossings[own])
             if a == b:
                 settled[own] |= (part[self.edges[crossings[own, 0]]] >= 0).any(axis=1)
@@ -154,6 +177,53 @@ class _Separator:
             if not settled[own].any():
                 pushes.append(self._nearer_ends(crossings[own]))
         return tuple(np.concatenate(columns) for columns in zip(*pushes, strict=True))
+
+    def _owners(self, crossings: np.ndarray) -> np.ndarray:
+        """(k, 2): the body of the edge and that of the triangle of crossings."""
+        return np.column_stack([self.owner[self.edges[crossings[:, 0], 0]], self.owner[self.triangles[crossings[:, 1], 0]]])
+
+    def _over(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+        """The vertices of body a over or under the open surface of b within the limit: which, how high, m, and their pushes through it."""
+        body = self.assembly.bodies[a]
+        candidates = np.flatnonzero(self.owner[self.triangles[:, 0]] == b)
+        push = self._pushed(np.unique(body.triangles), candidates, None)
+        quads, weights, _, lengths = push
+        corners = self.x[quads[:, 1:]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        away = np.einsum("kc,kci->ki", weights, self.x[quads])
+        height = np.einsum("ki,ki->k", away, normal) / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+        far = lengths - self._wanted(quads)
+        over = (np.abs(height) > OVER * far) & (far < 2.0 * self.limit)
+        return quads[over, 0], height[over], tuple(each[over] for each in push)
+
+    def _wrong_ends(self, crossings: np.ndarray, side: float) -> tuple[np.ndarray, ...]:
+        """Pushes of edges' ends that are on the wrong side of the triangles that they cross, along the normals of these, whatever is beside them."""
+        ends, faces = self.edges[crossings[:, 0]], self.triangles[crossings[:, 1]]
+        corners = self.x[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal *= side / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+        height = np.einsum("kei,ki->ke", self.x[ends] - corners[:, :1], normal)
+        row, low = np.arange(len(ends)), np.argmin(height, axis=1)
+        share = (height[row, 1 - low] / np.maximum(np.ptp(height, axis=1), 1e-300))[:, None]  # of the low end in the crossing
+        crossing = share * self.x[ends[row, low]] + (1.0 - share) * self.x[ends[row, 1 - low]]
+        quads = np.column_stack([ends[row, low], faces])
+        weights = np.column_stack([np.ones(len(ends)), -closest_on_triangles(crossing, corners)])
+        return quads, weights, normal, self._wanted(quads) - height[row, low]
+
+    def _order(self, a: int, b: int) -> None:
+        """Decides which of two open surfaces that cross is above the other: what takes less motion."""
+        vertices, height, push = self._over(a, b)
+        below, above = (np.sum(np.maximum(sign * height, 0.0)) for sign in (-1.0, 1.0))
+        side = 1.0 if above >= below else -1.0
+        # b is to be on the other side of a, along a's own normal
+        faces = self.triangles[self.owner[self.triangles[:, 0]] == a]
+        corners = self.x[faces]
+        normals = np.zeros_like(self.x)
+        for k in range(3):
+            np.add.at(normals, faces[:, k], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        along = np.sum(np.einsum("ki,ki->k", normals[vertices], push[2]) * -np.sign(height))
+        self.orders[a, b] = side
+        self.orders[b, a] = -side if along >= 0.0 else side
 
     def _wrong(self, a: int, b: int, crossings: np.ndarray) -> np.ndarray:
         """(n,) int: which part of body a each vertex belongs to that is on the wrong side of body b; -1 for all others."""
