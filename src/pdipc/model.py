@@ -12,7 +12,7 @@ import warp as wp
 from pdipc import constraints
 from pdipc.bodies import cloth
 from pdipc.bodies.elasticity import elasticity, speed_of_sound
-from pdipc.collision import surface
+from pdipc.collision import faces, surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
@@ -258,7 +258,7 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
         solver=solver,
         free_vertices=free,
         held=held,
-        surface=surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle),
+        surface=_surface(assembly, place),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
         triangles=assembly.triangles,
         followers=[
@@ -326,6 +326,13 @@ def _per_vertex(scene: Scene, assembly: Assembly, mass: np.ndarray, free: np.nda
             found["rigidity"][own] = h**2 / (h**2 + crossing**2)
     found["kappa"][~free] = found["body_mass"][~free] = 0.0
     return found
+
+
+def _surface(assembly: Assembly, place: Device) -> surface.Surface:
+    keeps_shape = assembly.keeps_shape[assembly.body_of_vertex]
+    tolerance = faces.FLAT * assembly.activation_distance
+    face = faces.flat_faces(assembly.positions, assembly.triangles, keeps_shape, tolerance)
+    return surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle, face)
 
 
 def _nonlinear_solver(scene: Scene) -> str:

@@ -71,6 +71,7 @@ class Work:
             model.rest_separation,
             len(model.assembly.quarantine),
         )
+        self.candidates.flatten(self.script.keeps_shape())
         self.quarantine = Quarantine(model.assembly)
         self.truncation = Truncation(device, real, n, settings.per_vertex_truncation, [b.all for b in model.followers])
         self.truncation.keep_rigid(self.script.rigid())
@@ -115,6 +116,7 @@ class Work:
         if before != (self.script.moves, [vertices[0] for vertices in self.script.rigid()]):
             self.truncation.keep_rigid(self.script.rigid())
             self.script.generation += 1
+        self.candidates.flatten(self.script.keeps_shape())
 
     def run(self, part: Callable[["Work"], None]) -> None:
         """Replays `part` of Algorithm 1; records it first where it is new or arrays were replaced."""

@@ -22,7 +22,7 @@ import warp as wp
 
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
-from pdipc.collision.candidates import Candidates
+from pdipc.collision.candidates import SILENT, Candidates
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, kernel
 
@@ -37,6 +37,7 @@ def kernels(real: Real) -> SimpleNamespace:
     dist, bar = distance.functions(real), barrier.functions(real)
     far = wp.constant(real.scalar(1.0e30))
     least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
+    silent = wp.constant(SILENT)
 
     @wp.func
     def vertex_triangle_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
@@ -70,6 +71,7 @@ def kernels(real: Real) -> SimpleNamespace:
             x: wp.array(dtype=vec3),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
+            faces: wp.array(dtype=wp.int32),
             gaps_out: wp.array(dtype=scalar),
             active_out: wp.array(dtype=wp.int32),
             closest_out: wp.array(dtype=scalar),
@@ -81,7 +83,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 smallest = far
                 for k in range(begin, wp.min(begin + span.block, count[0])):
                     # CCD has proven it positive; measured in this precision it may round to less, of which there is no logarithm
-                    gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
+                    gap = far
+                    if faces[k] != silent:
+                        gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
                     gaps_out[k] = gap
                     if gap < limits[k][1]:
                         active += 1
@@ -90,6 +94,49 @@ def kernels(real: Real) -> SimpleNamespace:
                 closest_out[begin // span.block] = -smallest
 
         return measure_gaps
+
+    @wp.func
+    def nearest_of_face(
+        k: int,
+        count: int,
+        quads: wp.array(dtype=wp.vec4i),
+        faces: wp.array(dtype=wp.int32),
+        gaps: wp.array(dtype=scalar),
+    ) -> bool:
+        """Whether no other triangle of its face is as near to the vertex of pair k, which has its pairs in a row; the first of equals is."""
+        nearest = bool(True)
+        if faces[k] >= 0:
+            for way in range(2):
+                step = 1 - 2 * way
+                j = k + step
+                while nearest and j >= 0 and j < count:
+                    if quads[j][0] != quads[k][0]:
+                        j = count
+                    else:
+                        if faces[j] == faces[k] and (gaps[j] < gaps[k] or (way == 1 and gaps[j] == gaps[k])):
+                            nearest = False
+                        j += step
+        return nearest
+
+    @wp.kernel(module=module)
+    def claim(
+        span: Span,
+        count: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        limits: wp.array(dtype=vec2),
+        faces: wp.array(dtype=wp.int32),
+        gaps: wp.array(dtype=scalar),
+        active_out: wp.array(dtype=wp.int32),
+    ):
+        """For each block how many are active, of a flat face one."""
+        worker = span.first + wp.tid()
+        for begin in range(worker * span.block, quads.shape[0], span.step * span.block):
+            active = int(0)
+            for k in range(begin, wp.min(begin + span.block, count[0])):
+                if gaps[k] < limits[k][1]:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                    if nearest_of_face(k, count[0], quads, faces, gaps):
+                        active += 1
+            active_out[begin // span.block] = active
 
     @wp.kernel(module=module)
     def total(
@@ -100,11 +147,11 @@ def kernels(real: Real) -> SimpleNamespace:
         count_out: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
     ):
-        """count: pairs that fit, all pairs, those of the first kind."""
+        """count: pairs that fit, the most ever found, those of the first kind."""
         first_kind = ends_a[ends_a.shape[0] - 1]
         found = first_kind + ends_b[ends_b.shape[0] - 1]
         count_out[0] = wp.min(found, capacity)
-        count_out[1] = found
+        count_out[1] = wp.max(count_out[1], found)
         count_out[2] = first_kind
         if found > capacity:
             overflow[0] = 1
@@ -119,6 +166,7 @@ def kernels(real: Real) -> SimpleNamespace:
             x: wp.array(dtype=vec3),
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
+            faces: wp.array(dtype=wp.int32),
             gaps: wp.array(dtype=scalar),
             ends: wp.array(dtype=wp.int32),
             totals: wp.array(dtype=wp.int32),
@@ -143,7 +191,11 @@ def kernels(real: Real) -> SimpleNamespace:
                     slot += totals[2]
                 for k in range(begin, wp.min(begin + span.block, count[0])):
                     d_hat = limits[k][1]
-                    if gaps[k] < d_hat and slot < quads_out.shape[0]:
+                    acts = gaps[k] < d_hat and slot < quads_out.shape[0]
+                    if wp.static(not edge_edge):  # noqa: SIM102  (known when the kernel is made)
+                        if acts:
+                            acts = nearest_of_face(k, count[0], quads, faces, gaps)
+                    if acts:
                         q = quads[k]
                         p0 = x[q[0]]
                         p1 = x[q[1]] - p0
@@ -372,6 +424,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         total=total,
+        claim=claim,
         measure_vertex_triangle=measure("vertex_triangle", vertex_triangle_gap),
         measure_edge_edge=measure("edge_edge", edge_edge_gap),
         freeze_vertex_triangle=freeze("vertex_triangle"),
@@ -428,7 +481,7 @@ class ActivePairs:
         n = len(kappa)
         self.device, self.real, self.kernels = device, real, kernels(real)
         self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
-        self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; pairs found; of these vertex-triangle
+        self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; most found; of these vertex-triangle
         self.closest = wp.zeros(2, dtype=real.scalar, device=device.warp)  # smallest gap of each kind, negative, m
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
@@ -464,14 +517,16 @@ class ActivePairs:
         """
         k, device = self.kernels, self.device
         for slot, c in enumerate(candidates.lists):
-            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.found, c.closest]
+            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.found, c.closest]
             device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
+            if candidates.surface.has_faces and slot == 0:
+                device.launch_list(k.claim, c.capacity, [c.count, c.quads, c.limits, c.faces, c.gaps, c.found])
             device.scan(c.found, c.ends)
             c.largest.max(c.closest, self.closest, slot)
         ends = [c.ends for c in candidates.lists]
         device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
         for c in candidates.lists:
-            inputs = [c.count, x, c.quads, c.limits, c.gaps, c.ends, self.count]
+            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.ends, self.count]
             inputs += [self.kappa, self.friction_of_vertex, self.free]
             inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
             inputs += [self.stiffness, self.coefficient, self.share]

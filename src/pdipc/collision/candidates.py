@@ -34,6 +34,7 @@ from pdipc.device.precision import Real
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
 ROUNDING = 1.0e-5  # relative, of all that a reach is made of
 LEAST_MARGIN = 1.0e-100  # m
+SILENT = -2  # in place of a face: the pair is stopped by CCD, and has no barrier of its own (`faces`)
 IGNORED = -1.0  # the activation distance of a pair that ignores each other: it neither acts nor stops anything
 REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as minimum separation, at most
 ROD_SEPARATION = 0.7  # the same of rods, which are as thick as their radius also where they touch themselves
@@ -46,6 +47,7 @@ def kernels(real: Real) -> SimpleNamespace:
     dist = distance.functions(real)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
     nothing = wp.constant(scalar(IGNORED))
+    silent = wp.constant(SILENT)
 
     @wp.func
     def limits(
@@ -86,8 +88,12 @@ def kernels(real: Real) -> SimpleNamespace:
         rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
         ignored: wp.array(dtype=wp.vec2i),
+        flat: wp.array(dtype=wp.int32),
+        face: wp.array(dtype=wp.int32),
+        inner_vertex: wp.array(dtype=wp.int32),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
+        faces_out: wp.array(dtype=wp.int32),
     ):
         worker = span.first + wp.tid()
         for begin in range(worker * span.block, count[0], span.step * span.block):
@@ -96,7 +102,13 @@ def kernels(real: Real) -> SimpleNamespace:
                 t = triangles[pairs[k][1]]
                 quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
                 rest_distance = scalar(0.0)
-                if body[v] == body[t[0]]:
+                faces_out[k] = -1
+                if body[v] != body[t[0]]:
+                    if flat[body[v]] * inner_vertex[v] > 0:
+                        faces_out[k] = silent
+                    elif flat[body[t[0]]] > 0:
+                        faces_out[k] = face[pairs[k][1]]
+                else:
                     rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
                 limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
@@ -112,8 +124,12 @@ def kernels(real: Real) -> SimpleNamespace:
         rest_separation: wp.array(dtype=scalar),
         d_hat: scalar,
         ignored: wp.array(dtype=wp.vec2i),
+        flat: wp.array(dtype=wp.int32),
+        inner: wp.array(dtype=wp.int32),
+        _inner_vertex: wp.array(dtype=wp.int32),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
+        faces_out: wp.array(dtype=wp.int32),
     ):
         worker = span.first + wp.tid()
         for begin in range(worker * span.block, count[0], span.step * span.block):
@@ -122,7 +138,11 @@ def kernels(real: Real) -> SimpleNamespace:
                 b = edges[pairs[k][1]]
                 quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
                 rest_distance = scalar(0.0)
-                if body[a[0]] == body[b[0]]:
+                faces_out[k] = -1
+                if body[a[0]] != body[b[0]]:
+                    if flat[body[a[0]]] * inner[pairs[k][0]] + flat[body[b[0]]] * inner[pairs[k][1]] > 0:
+                        faces_out[k] = silent
+                else:
                     rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
                 limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
@@ -188,7 +208,8 @@ class CandidateList:
     """The candidate pairs of one kind, as vertex quadruples with their limits, and room for what is found out about each.
 
     Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1). quads: (capacity,) vec4i. limits: (capacity,)
-    vec2 of minimum separation xi and activation distance d_hat, m. count: (1,) int32 on the device.
+    vec2 of minimum separation xi and activation distance d_hat, m. faces: (capacity,) int32, the flat face that the triangle of a pair is part of, -1
+    for none, or SILENT. count: (1,) int32 on the device.
     gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`.
     """
 
@@ -202,10 +223,10 @@ class CandidateList:
             return wp.zeros(size, dtype=dtype, device=self.device.warp)
 
         real, blocks = self.real, -(-capacity // self.device.block)
-        self.quads = self.limits = self.gaps = self.times = None  # the old ones are given back first
+        self.quads = self.limits = self.faces = self.gaps = self.times = None  # the old ones are given back first
         self.count, self.capacity = count, capacity
         self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
-        self.gaps, self.times = make(capacity, real.scalar), make(capacity, wp.int32)
+        self.gaps, self.times, self.faces = make(capacity, real.scalar), make(capacity, wp.int32), make(capacity, wp.int32)
         self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
         self.largest = Reducer(self.device, real, blocks)
 
@@ -216,7 +237,7 @@ class Candidates:
     Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
     the device; what was listed is then incomplete, and the caller has to `grow` and list again.
     rest_separation: (n,) the part of its distance at rest that a pair of one body keeps at most, REST_SEPARATION where None.
-    ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
+    flat: (bodies,) int32, 1 where the faces of a body are flat; see `flatten`. ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
     needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
     """
 
@@ -241,6 +262,7 @@ class Candidates:
         self.device, self.real, self.surface, self.broad_phase = device, real, surface, broad_phase
         self.half_separation, self.activation_distance, self.margin = half_separation, activation_distance, margin
         self.kernels = kernels(real)
+        self.flat = wp.ones(int(surface.body_of_vertex.numpy().max(initial=-1)) + 1, dtype=wp.int32, device=device.warp)
         self.rest = wp.array(rest_positions, dtype=real.vec3, device=device.warp)
         self.begin = wp.zeros(n, dtype=real.vec3, device=device.warp)
         self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
@@ -274,6 +296,12 @@ class Candidates:
             self.ignored.assign(bodies.astype(np.int32))
             self.invalidate()
 
+    def flatten(self, bodies: np.ndarray) -> None:
+        """Which bodies, (b,) bool, have their faces from now on: those that still have the shape that these were found in."""
+        if not np.array_equal(self.flat.numpy(), bodies):
+            self.flat.assign(bodies.astype(np.int32))
+            self.invalidate()
+
     def restructure(self, x: wp.array) -> None:
         """Renews the structures of the culling around x; what they find does not depend on it."""
         self.broad_phase.restructure(x, self.half_separation)
@@ -292,10 +320,10 @@ class Candidates:
         self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
         self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
         common = [self.surface.body_of_vertex, self.rest, self.half_separation]
-        common += [self.rest_separation, self.activation_distance, self.ignored]
-        primitives = (self.surface.triangles, self.surface.edges)
-        for own, found, of in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
-            inputs = [found.count, found.pairs, of, *common, own.quads, own.limits]
+        common += [self.rest_separation, self.activation_distance, self.ignored, self.flat]
+        primitives = ((self.surface.triangles, self.surface.face), (self.surface.edges, self.surface.inner_edge))
+        for own, found, (of, flat) in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
+            inputs = [found.count, found.pairs, of, *common, flat, self.surface.inner_vertex, own.quads, own.limits, own.faces]
             self.device.launch_list(getattr(self.kernels, f"{own.kind}_limits"), own.capacity, inputs)
 
     def check(self, x0: wp.array, x1: wp.array) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from pdipc.collision import faces
 from pdipc.device.launch import Device
 
 MORTON_BITS = 20  # of each coordinate
@@ -23,6 +24,7 @@ class Surface:
     pass through each other; a body's held vertices may meet nothing, or an edge that they pull would pass through).
     members: vertices (s, 1), edges (k, 2) and triangles (m, 3) as NumPy arrays; codes: their Morton codes, uint64, ascending
     within a body.
+    face: (m,) int32, the flat face of each triangle (`collision.faces`), -1 for none; inner_edge: (k,) and inner_vertex: (n,) int32, 1 inside of one.
     """
 
     triangles: wp.array
@@ -33,6 +35,10 @@ class Surface:
     members: list[np.ndarray]
     codes: list[np.ndarray]
     obstacle_numpy: np.ndarray
+    face: wp.array
+    inner_edge: wp.array
+    inner_vertex: wp.array
+    has_faces: bool
 
 
 def unique_edges(triangles: np.ndarray) -> np.ndarray:
@@ -60,8 +66,12 @@ def build(
     rest_positions: np.ndarray,
     body_of_vertex: np.ndarray,
     obstacle: np.ndarray,
+    face: np.ndarray | None = None,
 ) -> Surface:
-    """The surface of triangles (m, 3) int32; rest_positions (n, 3), body_of_vertex (n,) and obstacle (n,) bool of all vertices."""
+    """The surface of triangles (m, 3) int32; rest_positions (n, 3), body_of_vertex (n,) and obstacle (n,) bool of all vertices.
+
+    face: (m,) int32 of each triangle, as `faces.flat_faces` finds them.
+    """
     triangles = np.ascontiguousarray(triangles, dtype=np.int32).reshape(-1, 3)
     rest = np.asarray(rest_positions, dtype=np.float64)
     body = np.asarray(body_of_vertex, dtype=np.int32)
@@ -73,6 +83,8 @@ def build(
     orders = [np.lexsort((code, own)) for code, own in zip(codes, bodies, strict=True)]
     members = [np.ascontiguousarray(m[order]) for m, order in zip(members, orders, strict=True)]
     codes = [code[order] for code, order in zip(codes, orders, strict=True)]
+    face = (np.full(len(triangles), -1) if face is None else face)[orders[2]]
+    inner_edge, inner_vertex = faces.inside(members[2], face, members[1], len(rest))
 
     def upload(values: np.ndarray, dtype) -> wp.array:
         return wp.array(values, dtype=dtype, device=device.warp)
@@ -86,4 +98,6 @@ def build(
         members,
         codes,
         np.asarray(obstacle, dtype=bool),
+        *(upload(each.astype(np.int32), wp.int32) for each in (face, inner_edge, inner_vertex)),
+        bool((face >= 0).any()),
     )

@@ -349,6 +349,14 @@ class Script:
                 found.append(mover.vertices)
         return found
 
+    def keeps_shape(self) -> np.ndarray:
+        """(bodies,) bool: who has the shape of the start, now that some obstacles deform as commanded."""
+        keeps = self.assembly.keeps_shape
+        for mover in self.movers:
+            if mover.body >= 0 and mover.key in self.leads and self.leads[mover.key].points is not None:
+                keeps[mover.body] = False
+        return keeps
+
     # Before and after a step.
 
     def plan(self, time: float, reached: Reached, positions: wp.array) -> None:

@@ -261,6 +261,11 @@ class Assembly:
         return np.array([body.kinematic for body in self.bodies])[self.body_of_vertex]
 
     @property
+    def keeps_shape(self) -> np.ndarray:
+        """(bodies,) bool: rigid bodies, and obstacles that no cache deforms."""
+        return np.array([b.kind == "rigid" or (b.trajectory is not None and b.trajectory.is_rigid) for b in self.bodies])
+
+    @property
     def kinematic_vertices(self) -> np.ndarray:
         """(k,) int32, ascending: the numbers of the scripted vertices."""
         return np.flatnonzero(self.scripted).astype(np.int32)
