@@ -66,7 +66,7 @@ def test_a_run_interrupted_anywhere_goes_on_to_the_same_bits(place, tmp_path, mo
         if place == "in a sub-step":
             patched.setattr(Work, "run", interrupted(Work.run, 35))
         elif place == "between sub-steps":
-            patched.setattr(simulations, "step", interrupted(simulations.step, 8))
+            patched.setattr(simulations, "stepping", interrupted(simulations.stepping, 8))
         elif place == "before a frame":
             patched.setattr(results.RunWriter, "append", interrupted(results.RunWriter.append, 4))
         elif place == "in a frame":

@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from pdipc.simulation import run_scene as run_scene
     from pdipc.simulation import simulate as simulate
     from pdipc.sweeps.run import run_sweep as run_sweep
+    from pdipc.worlds import Worlds as Worlds
+    from pdipc.worlds import run_worlds as run_worlds
 
 __version__ = "0.1.0"
 
@@ -96,6 +98,7 @@ __all__ = [
     "Stitch",
     "VertexForce",
     "Wind",
+    "Worlds",
     "build",
     "check_scene",
     "find_intersections",
@@ -103,6 +106,7 @@ __all__ = [
     "open_run",
     "run_scene",
     "run_sweep",
+    "run_worlds",
     "simulate",
     "step",
     "time_of_impact",
@@ -146,6 +150,7 @@ _PUBLIC = {
     "Stitch": "pdipc.scene.schema",
     "VertexForce": "pdipc.scene.schema",
     "Wind": "pdipc.scene.schema",
+    "Worlds": "pdipc.worlds",
     "build": "pdipc.model",
     "check_scene": "pdipc.scene.check:check",
     "find_intersections": "pdipc.judge.witness",
@@ -153,6 +158,7 @@ _PUBLIC = {
     "open_run": "pdipc.output.results",
     "run_scene": "pdipc.simulation",
     "run_sweep": "pdipc.sweeps.run",
+    "run_worlds": "pdipc.worlds",
     "simulate": "pdipc.simulation",
     "step": "pdipc.drive",
     "time_of_impact": "pdipc.collision.queries",

@@ -1,6 +1,6 @@
 """One time step as its caller sees it: record, run, grow what was full, judge what is foreign, report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,7 +8,7 @@ import warp as wp
 
 from pdipc import algorithm
 from pdipc.bodies import rigid
-from pdipc.device.launch import one_at_a_time
+from pdipc.device.launch import Graph, one_at_a_time, replayed
 from pdipc.integration import status
 from pdipc.integration.inertia import CHORDS, FIRST_NUMBER, FOREIGN, GAP, LINEAR, LOCAL_GLOBAL, TIMES
 from pdipc.judge.witness import find_intersections
@@ -73,9 +73,15 @@ def step(
     Raises ValueError for a state of another model, and for one that intersects: positions that the last step with `work` did not
     end at are judged by the witness.
     """
-    work = work or Work(model)
+    return replayed(stepping(model, state, work or Work(model), observe, into))
+
+
+def stepping(
+    model: Model, state: State, work: Work, observe: Callable | None = None, into: State | None = None
+) -> Generator[Graph, None, StepResult]:
+    """`step` as a task (`launch.Task`), so that the steps of several simulations go side by side."""
     _belongs(model, state, work)
-    motions = _solve(model, state, work, observe is not None)
+    motions = yield from _solve(model, state, work, observe is not None)
     report = work.report.numpy().tolist()
     if report[FOREIGN]:
         _judge(model, state, work)
@@ -85,7 +91,7 @@ def step(
     return _result(model, state, work, report, into)
 
 
-def _solve(model: Model, state: State, work: Work, observed: bool) -> list[tuple[wp.array, wp.array]]:
+def _solve(model: Model, state: State, work: Work, observed: bool) -> Generator[Graph, None, list[tuple[wp.array, wp.array]]]:
     """Takes the step, again from its start whenever a list was full; returns the motions that were committed, where they are observed."""
     work.foreign.zero_()
     model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
@@ -100,14 +106,14 @@ def _solve(model: Model, state: State, work: Work, observed: bool) -> list[tuple
         wp.copy(work.rest, state.remainders)
         motions = []
         if not observed:
-            work.run(algorithm.time_step)
+            yield from work.run(algorithm.time_step)
         else:
-            work.run(algorithm.begin)
+            yield from work.run(algorithm.begin)
             while int(work.going.numpy()[0]) != 0:
                 begin = wp.clone(work.x)
-                work.run(algorithm.outer_iteration)
+                yield from work.run(algorithm.outer_iteration)
                 motions.append((begin, wp.clone(work.x)))
-            work.run(algorithm.finish)
+            yield from work.run(algorithm.finish)
         if int(work.report.numpy()[status.STATUS]) != status.OVERFLOW:
             return motions
         if not work.grow():  # a list was full: with more room, the step is taken again

@@ -26,6 +26,7 @@ from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
 from pdipc.scene.schema import Scene, uses_newton
+from pdipc.scene.worlds import refuse_worlds
 
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
@@ -208,6 +209,7 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     Raises SceneError for what `pdipc.check_scene` finds, before anything is launched.
     """
     assembly = assemble(scene)
+    refuse_worlds(scene, "a model")
     assembly.masses = masses
     sim = scene.simulation
     place = device if isinstance(device, Device) else Device(device or sim.device)

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,13 @@ import warp as wp
 from pdipc.audit.contact import collect, mean
 from pdipc.control.commands import Controls
 from pdipc.control.phases import model_at
-from pdipc.device.launch import one_at_a_time
-from pdipc.drive import StepResult, Work, step
+from pdipc.device.launch import Graph, one_at_a_time, replayed
+from pdipc.drive import StepResult, Work, stepping
 from pdipc.model import Model, State, build
 from pdipc.scene.schema import Scene
 
 if TYPE_CHECKING:
-    from pdipc.output.results import RunWriter
+    from pdipc.output.results import Run, RunWriter
 
 CHECKPOINT_SECONDS = 10.0  # a checkpoint is written when the last one is older
 
@@ -79,11 +79,15 @@ class Simulation(Controls):
 
         forces: also the forces of contact, `result.forces`, on vertices, bodies and pairs of bodies.
         """
+        return replayed(self.stepping(forces))
+
+    def stepping(self, forces: bool = False) -> Generator[Graph, None, StepResult]:
+        """`step` as a task; see `pdipc.drive.stepping`."""
         self.model.device.refuse_forked()
         results, contact = [], []
         for _ in range(self.model.substeps):
             self._hold()
-            results.append(step(self.model, self.state, self.work, self.observe, into=self.state))
+            results.append((yield from stepping(self.model, self.state, self.work, self.observe, into=self.state)))
             if forces:
                 contact.append(collect(self.model, self.positions, self.work.method.exerted()))
         result = _merge(results)
@@ -113,6 +117,8 @@ class Simulation(Controls):
 
 def _merge(results: list[StepResult]) -> StepResult:
     """Of a step's sub-steps: counts and times add up, lengths are the worst, the rest is that of the last."""
+    if len(results) == 1:
+        return results[0]
     merged = {
         field.name: _merged(field.name, [getattr(r, field.name) for r in results]) for field in dataclasses.fields(StepResult)
     }
@@ -201,39 +207,49 @@ def run_scene(
     run, is being written by another process, or has no room.
     """
     from pdipc.output.progress import bar_of_steps
-    from pdipc.output.results import RunError, RunWriter, open_run
 
     if progress is True:
         with bar_of_steps(scene.simulation.steps if steps is None else steps) as advance:
             options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
             return run_scene(scene, out_dir, steps=steps, device=device, progress=advance, **options)
-    if resume:
-        begun = open_run(out_dir)
-        if where := _first_difference(*(_without_steps(each) for each in (Scene.model_validate(begun.scene), scene))):
-            raise RunError(
-                f"{out_dir} holds a run of another scene ({where} differs); resume it with its own scene and options"
-            )
+    begun = begun_run(scene, out_dir) if resume else None
+    if begun is not None:
         device = device or begun.meta.get("device")
     simulation = Simulation(scene, device)
+    steps = scene.simulation.steps if steps is None else steps
+    with writer_of(simulation, out_dir, begun, overwrite) as writer:
+        replayed(running(simulation, writer, steps, certify, forces, progress or None))
+
+
+def begun_run(scene: Scene, folder: str | Path) -> "Run":
+    """The run of a scene that was begun in `folder`. Raises RunError where it is of another scene."""
+    from pdipc.output.results import RunError, open_run
+
+    begun = open_run(folder)
+    if where := _first_difference(*(_without_steps(each) for each in (Scene.model_validate(begun.scene), scene))):
+        raise RunError(f"{folder} holds a run of another scene ({where} differs); resume it with its own scene and options")
+    return begun
+
+
+def writer_of(simulation: Simulation, folder: str | Path, begun: "Run | None", overwrite: bool = False) -> "RunWriter":
+    """What writes a simulation's run into `folder`, or goes on with the one that was begun there. Raises RunError."""
+    from pdipc.output.results import RunError, RunWriter
+
     model = simulation.model
-    steps = model.scene.simulation.steps if steps is None else steps
     made_by = {"device": model.device.name, "precision": model.real.name}
-    if resume:
+    if begun is not None:
         for name, now in made_by.items():
             if begun.meta.get(name, now) != now:
                 raise RunError(
-                    f"{out_dir} was run on {begun.meta[name]}; going on with {name} {now} would not give the same results"
+                    f"{folder} was run on {begun.meta[name]}; going on with {name} {now} would not give the same results"
                 )
-        writer = RunWriter.resume(out_dir)
-    else:
-        topology = {"triangles": model.triangles, **model.assembly.topology()}
-        dropped = 0.0 if model.solver is None else model.solver.dropped
-        meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
-        if model.assembly.separated:
-            meta["moved_at_the_start"] = model.assembly.separated
-        writer = RunWriter.create(out_dir, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
-    with writer:
-        _run(simulation, writer, steps, certify, forces, progress or None)
+        return RunWriter.resume(folder)
+    topology = {"triangles": model.triangles, **model.assembly.topology()}
+    dropped = 0.0 if model.solver is None else model.solver.dropped
+    meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
+    if model.assembly.separated:
+        meta["moved_at_the_start"] = model.assembly.separated
+    return RunWriter.create(folder, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
 
 
 def _without_steps(scene: Scene) -> dict[str, Any]:
@@ -253,15 +269,15 @@ def _first_difference(a: Any, b: Any, path: str = "") -> str | None:
     return next(filter(None, (_first_difference(*values, where) for where, *values in inner)), None)
 
 
-def _run(
+def running(
     simulation: Simulation,
     writer: "RunWriter",
     steps: int,
-    certify: bool,
-    forces: bool,
-    progress: Callable[[StepInfo], None] | None,
-) -> None:
-    """From the last checkpoint, or the start where there is none, to the end."""
+    certify: bool = False,
+    forces: bool = False,
+    progress: Callable[[StepInfo], None] | None = None,
+) -> Generator[Graph, None, None]:
+    """A run from its last checkpoint, or the start where there is none, to the end, as a task (`launch.Task`)."""
     checkpoint = writer.latest_checkpoint()
     if checkpoint is not None:
         simulation.state = simulation.model.state_from(checkpoint[1])
@@ -284,7 +300,7 @@ def _run(
     try:
         while done < steps:
             whole, motions = False, 0
-            result = simulation.step(forces=True)
+            result = yield from simulation.stepping(forces=True)
             assert result.forces is not None
             contact = result.forces.arrays(vertices=forces)
             writer.append(simulation.steps_done, simulation.state.time, simulation.positions, stats_of(result), contact)

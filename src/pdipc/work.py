@@ -1,7 +1,7 @@
 """The buffers of a step, allocated once for a model, and the recorded step."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 import numpy as np
 import warp as wp
@@ -118,8 +118,8 @@ class Work:
             self.script.generation += 1
         self.candidates.flatten(self.script.keeps_shape())
 
-    def run(self, part: Callable[["Work"], None]) -> None:
-        """Replays `part` of Algorithm 1; records it first where it is new or arrays were replaced."""
+    def run(self, part: Callable[["Work"], None]) -> Generator[Graph, None, None]:
+        """Yields the graph of `part` of Algorithm 1, recorded first where it is new or arrays were replaced; what is not recorded is run."""
         if not self.recorded:
             part(self)
             return
@@ -129,7 +129,7 @@ class Work:
         name = part.__name__
         if name not in self._graphs:
             self._graphs[name] = self.device.capture(lambda: part(self), self)
-        self._graphs[name].launch()
+        yield self._graphs[name]
 
     def grow(self) -> bool:
         """Makes room where a list was full; returns whether one was."""

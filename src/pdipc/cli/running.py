@@ -63,20 +63,27 @@ def run(
         if value is not None:
             _override(loaded, name, value)
     folder = out or Path("runs") / Path(scene).stem
-    begun = open_run(folder).frame_count - 1 if resume else 0
+    several = loaded.worlds is not None
+    if several and audited:
+        raise typer.BadParameter("of several worlds each is audited by itself: pdipc audit DIR/0000", param_hint="--audit")
+    begun = open_run(folder).frame_count - 1 if resume and not several else 0
     total = loaded.simulation.steps if steps is None else steps
     began = time.monotonic()
     stop = Stop()
     try:
         with stop.after_steps(), bar_of_steps(total, Console(stderr=True)) as bar:
             from pdipc.simulation import run_scene
+            from pdipc.worlds import run_worlds
 
             def advance(info: "StepInfo") -> None:
+                nonlocal total
+                total = info.steps  # of all worlds
                 bar(info)
                 stop.step_done(info.step)
 
             options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
-            run_scene(loaded, folder, steps=steps, device=device, progress=advance, **options)
+            run = run_worlds if several else run_scene
+            run(loaded, folder, steps=steps, device=device, progress=advance, **options)
     except KeyboardInterrupt:
         if stop.done is None:
             typer.echo("pdipc: interrupted before a step was taken", err=True)
@@ -94,6 +101,9 @@ def run(
                 err=True,
             )
         raise typer.Exit(128 + stop.signal) from None  # what shells expect
+    if several:
+        _summary_of_worlds(folder, time.monotonic() - began)
+        return
     if resume and begun >= total:
         typer.echo(f"{folder} has {begun} steps already; nothing was added to it")
     _summary(folder, time.monotonic() - began)
@@ -167,6 +177,21 @@ def _summary(folder: Path, seconds: float) -> None:
         typer.echo(f"{stopped} steps ended at the limit of outer iterations before convergence; they are free of intersections")
 
 
+def _summary_of_worlds(folder: Path, seconds: float) -> None:
+    from pdipc.output.results import open_run
+    from pdipc.output.summary import smallest_gap
+
+    runs = [open_run(own.parent) for own in sorted(folder.glob("*/run.json"))]
+    steps = sum(len(run.stats) for run in runs)
+    typer.echo(f"{folder}: {len(runs)} worlds in folders 0000 to {len(runs) - 1:04d}, {steps} steps, {seconds:.1f} s of work")
+    gaps = [gap for run in runs if (gap := smallest_gap(run)) is not None]
+    typer.echo(f"smallest gap {metres(min(gaps, default=None))}")
+    stopped = sum(not record.get("converged", True) for run in runs for record in run.stats)
+    if stopped:
+        typer.echo(f"{stopped} steps ended at the limit of outer iterations before convergence; they are free of intersections")
+    typer.echo(str(folder / "table.csv"))
+
+
 @command()
 def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run folder or a scene.")]) -> None:
     """Describe a run or a scene."""
@@ -186,6 +211,10 @@ def info(what: Annotated[str, typer.Argument(metavar="DIR|SCENE", help="A run fo
     console.print(f"{scene.title or what}", style="bold", markup=False)
     if scene.description:
         console.print(scene.description, markup=False)
+    if scene.worlds is not None:
+        console.print(
+            f"{scene.worlds if isinstance(scene.worlds, int) else len(scene.worlds)} worlds; of each, before what is other in it:"
+        )
     table = Table(box=box.SIMPLE)
     for name in ("body", "kind", "vertices", "triangles", "tets"):
         table.add_column(name, justify="left" if name in ("body", "kind") else "right")

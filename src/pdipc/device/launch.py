@@ -17,9 +17,12 @@ Three kinds of kernels:
   `Device.launch_list`.
 """
 
+import concurrent.futures
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+import queue
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import warp as wp
@@ -65,6 +68,72 @@ class Graph:
         """Replays the recorded kernels; on the CPU returns when all are done."""
         self._device.refuse_forked()
         _together([functools.partial(wp.capture_launch, graph) for graph in self._graphs])
+
+    def begin(self, tell: Callable[[], None]) -> Future | None:
+        """Replays beside what the caller goes on with; `tell` is called, in whatever thread, when what it wrote can be read.
+
+        On the CPU the device must have one thread: the threads of another need the pool to themselves. On CUDA the work waits in the
+        device's stream, in whose order the caller follows; None is returned.
+        """
+        self._device.refuse_forked()
+        if self._device.is_cuda:
+            wp.capture_launch(self._graphs[0])
+            tell()
+            return None
+        (graph,) = self._graphs
+        future = shared.pool(shared.thread_count()).submit(wp.capture_launch, graph)
+        future.add_done_callback(lambda _: tell())
+        return future
+
+
+Task = Generator[Graph, None, Any]  # work of the host that yields graphs, and goes on when they have been replayed
+
+
+@one_at_a_time
+def _advance(task: Task, replay: Callable[[Graph], Any]) -> Any:
+    return replay(next(task))
+
+
+def replayed(task: Task) -> Any:
+    """What a task returns; its graphs are replayed as they come."""
+    while True:
+        try:
+            _advance(task, Graph.launch)
+        except StopIteration as end:
+            return end.value
+
+
+def side_by_side(tasks: Sequence[Task]) -> list[Any]:
+    """What each task returns; their graphs are replayed at the same time, on as many threads as there may be.
+
+    The tasks' own work is done here, one at a time. Where one raises, the others are finished first; then the error of the first of
+    them is raised, with a note of its number.
+    """
+    ready: queue.SimpleQueue[int] = queue.SimpleQueue()
+    results: list[Any] = [None] * len(tasks)
+    errors: dict[int, Exception] = {}
+    begun: dict[int, Future | None] = {}
+    for number in range(len(tasks)):
+        ready.put(number)
+    left = len(tasks)
+    try:
+        while left:
+            number = ready.get()
+            try:
+                if (replay := begun.pop(number, None)) is not None:
+                    replay.result()
+                tell = functools.partial(ready.put, number)
+                begun[number] = _advance(tasks[number], lambda graph: graph.begin(tell))
+            except StopIteration as end:
+                results[number], left = end.value, left - 1
+            except Exception as error:
+                errors[number], left = error, left - 1
+    finally:  # nothing is written any more when this returns, or is interrupted
+        concurrent.futures.wait([replay for replay in begun.values() if replay is not None])
+    for number, error in sorted(errors.items()):
+        error.add_note(f"in world {number} of {len(tasks)}")
+        raise error
+    return results
 
 
 def _together(parts: list[Callable[[], None]]) -> None:

@@ -395,7 +395,9 @@ def open_run(folder: str | Path) -> Run:
     if not folder.exists():
         raise RunError(f"{folder} does not exist")
     if not (folder / "run.json").is_file():
-        raise RunError(f"{folder} is not a run folder: it has no run.json")
+        runs = sorted(own.parent.name for own in folder.glob("*/run.json"))
+        hint = f"; it holds {len(runs)}: name one, such as {folder / runs[0]}" if runs else ""
+        raise RunError(f"{folder} is not a run folder: it has no run.json{hint}")
     return Run(folder)
 
 

@@ -22,6 +22,7 @@ from pdipc.scene.quarantine import Quarantine
 from pdipc.scene.reach import hints
 from pdipc.scene.schema import Cloth, Rigid, Rod, Scene, local_global_settings, uses_newton
 from pdipc.scene.separate import separate
+from pdipc.scene.worlds import scenes_of
 
 LISTED = 5  # vertices that a finding names
 CHUNK = 1 << 14  # primitives whose neighbours are looked for at a time
@@ -59,6 +60,25 @@ def check_file(path: str | Path) -> tuple[list[Finding], list[str]]:
 
 
 def _check_scene(scene: Scene, precision: str | None, part: RightPart) -> tuple[list[Finding], list[str]]:
+    if not isinstance(scene, Scene) or scene.worlds is None:
+        return _check_world(scene, precision, part)
+    try:
+        scenes = {id(each): (number, each) for number, each in reversed([*enumerate(scenes_of(scene))])}  # copies once
+    except SceneError as error:
+        return [_unreadable(str(error))], []
+    found: dict[Finding, list[int]] = {}
+    notes: dict[str, None] = {}
+    for number, each in sorted(scenes.values(), key=lambda numbered: numbered[0]):
+        findings, told = _check_world(each, precision, part)
+        notes |= dict.fromkeys(told)
+        for finding in findings:
+            found.setdefault(finding, []).append(number)
+    in_all = [finding for finding, numbers in found.items() if len(numbers) == len(scenes)]
+    in_some = [replace(f, where=f"world {', '.join(map(str, k))}: {f.where}") for f, k in found.items() if f not in in_all]
+    return in_all + in_some, list(notes)
+
+
+def _check_world(scene: Scene, precision: str | None, part: RightPart) -> tuple[list[Finding], list[str]]:
     assembly, problems = gather(scene, part.left_out, part.numbers)
     findings = [*_settings(scene), *map(_unreadable, problems)]
     if assembly is None:

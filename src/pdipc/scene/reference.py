@@ -158,6 +158,8 @@ def _type(annotation: Any) -> str:
         return f"list of {_type(inner[0])}"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    if origin is dict:
+        return "table"
     return {float: "number", int: "integer", str: "text", bool: "true or false", np.ndarray: "array"}[annotation]
 
 

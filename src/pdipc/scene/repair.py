@@ -4,6 +4,7 @@ from pdipc.scene.assembly import AssembledBody, Assembly, assemble
 from pdipc.scene.check import check, prepare
 from pdipc.scene.finding import Finding
 from pdipc.scene.schema import Arrays, Cloth, Rigid, Rod, Scene, Solid
+from pdipc.scene.worlds import refuse_worlds
 
 
 def repaired(scene: Scene, precision: str = "float64") -> tuple[Scene, list[str], list[Finding]]:
@@ -12,6 +13,7 @@ def repaired(scene: Scene, precision: str = "float64") -> tuple[Scene, list[str]
 
     Raises SceneError where it cannot be put together.
     """
+    refuse_worlds(scene, "what is repaired")
     wanted = scene.model_copy(deep=True)
     wanted.contact.start = "separate"
     assembly = assemble(wanted)

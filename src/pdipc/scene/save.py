@@ -24,24 +24,29 @@ def to_toml(scene: BaseModel, folder: Path) -> str:
     return "\n".join(lines).strip("\n") + "\n"
 
 
+def tables_of(scene: BaseModel) -> dict[str, Any]:
+    """What was given of a scene, as tables that make the same scene; files are named in full."""
+    return _plain(scene, None)
+
+
 def _is_section(value: Any) -> bool:
     return isinstance(value, dict) or (isinstance(value, list) and value != [] and all(isinstance(v, dict) for v in value))
 
 
-def _plain(value: Any, folder: Path, key: str = "") -> Any:
-    """TOML's kinds of value, without what was not given."""
+def _plain(value: Any, folder: Path | None, key: str = "") -> Any:
+    """TOML's kinds of value, without what was not given; with no folder arrays stay arrays, and files are named in full."""
     if isinstance(value, BaseModel):
         fields = {name: (entry, _plain(entry, folder, name)) for name, entry in value if entry is not None}
         given = value.model_fields_set.union(TAGS)
         # tables and lists that were not given may have been filled since
         return {name: plain for name, (entry, plain) in fields.items() if name in given or (_is_container(entry) and plain)}
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return value if folder is None else value.tolist()
     if isinstance(value, list | tuple):
         return [_plain(entry, folder) for entry in value]
     if isinstance(value, str) and key in FILES and not value.startswith("warp:"):
         file = Path(value).resolve()
-        return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
+        return (file.relative_to(folder) if folder and file.is_relative_to(folder) else file).as_posix()
     return value
 
 

@@ -29,8 +29,10 @@ from pdipc.scene.explain import short
 from pdipc.scene.garments import Inside
 from pdipc.scene.looks import Look, Picture
 from pdipc.scene.tables import Index, NotNegative, Number, Positive, Real, Table, Vector, Whole
+from pdipc.scene.vary import flat
 
 SHORTEST_STEP = 1e-9  # s
+MOST_WORLDS = 10_000
 
 Count = Annotated[Whole, Field(ge=1, le=10**9)]
 
@@ -881,6 +883,19 @@ class VertexForce(_Window):
 # --- the scene ---
 
 
+def _some_worlds(worlds: Any) -> Any:
+    if isinstance(worlds, int) and not isinstance(worlds, bool):
+        count = worlds
+    elif isinstance(worlds, list | tuple) and all(isinstance(changes, dict) for changes in worlds):
+        worlds = [flat(changes) for changes in worlds]
+        count = len(worlds)
+    else:
+        raise ValueError("must be a number of copies, or a list of tables with what is other in each world")
+    if not 1 <= count <= MOST_WORLDS:
+        raise ValueError(f"must be 1 to {MOST_WORLDS} worlds")
+    return worlds
+
+
 class Scene(Table):
     """Everything that a simulation starts from."""
 
@@ -896,6 +911,11 @@ class Scene(Table):
     stitches: list[Stitch] = Field(default=[], description="Threads that sew cloth.")
     forces: list[Annotated[Wind | VertexForce, Field(discriminator="kind")]] = Field(default=[], description="Beyond gravity.")
     picture: Picture = Field(default_factory=Picture, description="How runs are drawn.")
+    worlds: Annotated[int | list[dict[str, Any]], BeforeValidator(_some_worlds)] | None = Field(
+        default=None,
+        description="Several simulations side by side that do not see each other: a number of copies, or a table for each with what is other "
+        "in it, by dotted keys, such as `bodies.ball.velocity = [1, 0, 0]`; absent: one.",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> "Scene":

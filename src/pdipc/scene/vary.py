@@ -1,8 +1,10 @@
 """Other values in place of a scene's own, by their keys: what `pdipc sweep --set bodies.ball.material.density=500,1000` says."""
 
 import copy
+import json
 import re
 import tomllib
+from collections.abc import Iterator
 from typing import Any
 
 from pdipc.scene.errors import SceneError
@@ -43,6 +45,19 @@ def split_key(key: str) -> list[str]:
     except ValueError:
         pass
     raise SceneError(f'"{key}": is no key; keys are like contact.friction, bodies.ball.material.density, bodies."a b".friction')
+
+
+def flat(changes: dict[str, Any]) -> dict[str, Any]:
+    """Tables within tables as dotted keys: {"bodies": {"a b": {"friction": 1}}} is {'bodies."a b".friction': 1}. Arrays become lists."""
+    return {key: value for outer, inner in changes.items() for key, value in _below(outer, inner)}
+
+
+def _below(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _below(f"{key}.{name if re.fullmatch('[A-Za-z0-9_-]+', name) else json.dumps(name)}", inner)
+    else:
+        yield key, value.tolist() if hasattr(value, "tolist") else value
 
 
 def put(tables: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

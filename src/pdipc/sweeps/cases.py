@@ -12,6 +12,7 @@ from typing import Any
 from pdipc.output.results import RunError, RunLockedError, open_run
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.load import load_scene
+from pdipc.scene.worlds import refuse_worlds
 
 MOST_RUNS = 100_000
 LOCKED_SECONDS = 0.5  # between two looks at a run that another process writes
@@ -59,7 +60,9 @@ def combinations(scene: str | Path, settings: dict[str, list[Any]]) -> list[Case
     cases = []
     for number, values in enumerate(itertools.product(*settings.values())):
         changes = dict(zip(settings, values, strict=True))
-        cases.append(Case(number, changes, load_scene(scene, changes).model_dump_json()))
+        made = load_scene(scene, changes)
+        refuse_worlds(made, "each run of a sweep")
+        cases.append(Case(number, changes, made.model_dump_json()))
     return cases
 
 

@@ -56,7 +56,7 @@ def run_sweep(
     return failures
 
 
-def prepare(folder: Path, cases: list[Case], settings: dict[str, list[Any]], resume: bool, overwrite: bool) -> None:
+def prepare(folder: Path, cases: list[Case], settings: dict[str, Any], resume: bool, overwrite: bool) -> None:
     """Makes the folder, or sees that it holds this very sweep. Raises RunError."""
     if resume and overwrite:
         raise RunError("resume and overwrite exclude each other")
@@ -66,7 +66,7 @@ def prepare(folder: Path, cases: list[Case], settings: dict[str, list[Any]], res
     if resume:
         if not described.is_file():
             raise RunError(f"{folder} holds no sweep to go on with")
-        if json.loads(described.readtext_of(encoding="utf-8")) != json.loads(json.dumps(said)):
+        if json.loads(described.read_text(encoding="utf-8")) != json.loads(json.dumps(said)):
             raise RunError(
                 f"{folder} holds a sweep of another scene or by other values; go on with its own, or name a new folder"
             )

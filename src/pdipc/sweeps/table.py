@@ -40,7 +40,8 @@ def write_table(folder: Path, cases: list[Case], failures: dict[int, str]) -> No
             }
         )
     bodies.pop("positions_sha256", None)
-    columns = ["run", *cases[0].values, *RESULTS, *bodies, "positions_sha256", "error"]
+    keys = dict.fromkeys(key for case in cases for key in case.values)
+    columns = ["run", *keys, *RESULTS, *bodies, "positions_sha256", "error"]
     _write_csv(folder / "table.csv", columns, lines)
 
 
@@ -90,5 +91,5 @@ def _write_csv(path: Path, columns: list[str], lines: list[dict[str, Any]]) -> N
 
 def write(path: Path, text: str) -> None:
     temporary = path.with_name(path.name + ".tmp")
-    temporary.writetext_of(text, encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
