@@ -108,8 +108,7 @@ def functions(real: Real) -> SimpleNamespace:
 class Cavities:
     """Volumes and pressures of all cavities of a set, and their part of the Newton matrix that no block holds.
 
-    reference: (c,) m^3, the volumes at which energies are zero; 0 for V0. A gas holds far more energy than a step changes, and what is
-    tolerated of rounding is a part of the energy: so a step counts from where it starts.
+    reference: (c,) m^3, the volumes at which energies are zero; 0 for V0. Newton's method counts from the last iterate, see `_keep_energies` there.
     names: (c,) first vertices. laws: (c,) see the module; assign to it to change them. volume: (c,) float64, m^3; pressure: (c,), Pa.
     diagonal: None, it adds nothing to the preconditioner: one direction more costs conjugate gradients an iteration or two.
     """
