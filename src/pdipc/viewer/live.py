@@ -105,7 +105,7 @@ class Live:
             self.playing = gui.add_dropdown("show", (NOW, "frame", "play"), initial_value=NOW)
         with gui.add_folder("plots", expand_by_default=False):
             self.energies = Plot(gui, "energies, J", ("kinetic", "elastic", "contact", "gravity"))
-            self.residuals = Plot(gui, "residual, m", ("residual",), log=True)
+            self.residuals = Plot(gui, "residual, log10 of m", ("residual",), log=True)
         self.color = self.view.add_view_panel()
         engine.wants_pressure = self.color.value == "pressure"
         with gui.add_folder("record", expand_by_default=False):

@@ -35,7 +35,7 @@ class Playback:
             buttons = gui.add_button_group("", ("back", "on"))
             self.speed = gui.add_slider("speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="1 is real time")
         with gui.add_folder("plots", expand_by_default=False):
-            residuals = Plot(gui, "residual, m", ("residual",), log=True)
+            residuals = Plot(gui, "residual, log10 of m", ("residual",), log=True)
         solved = [record for record in run.records if record.get("residual")]
         residuals.show([record["time"] for record in solved], [(record["residual"],) for record in solved])
         self.color = self.view.add_view_panel()

@@ -258,17 +258,18 @@ class Stage:
 
 
 class Plot:
-    """Curves over time on the page. names: of the curves; log: whether the axis of values is logarithmic."""
+    """Curves over time on the page. names: of the curves; log: whether their common logarithms are drawn."""
 
     def __init__(self, gui: Any, title: str, names: Sequence[str], log: bool = False):
-        series = [{}, *({"label": name, "stroke": color, "width": 1.5} for name, color in zip(names, PALETTE, strict=False))]
-        scales = {"x": {"time": False}, **({"y": {"distr": 3}} if log else {})}
+        self.log = log
+        series = [{"label": "time, s"}, *({"label": name, "stroke": color, "width": 1.5} for name, color in zip(names, PALETTE, strict=False))]
         empty = tuple(np.zeros(0) for _ in series)
-        self.chart = gui.add_uplot(empty, tuple(series), title=title, scales=scales, axes=({}, {"size": 64}), height=150)
+        self.chart = gui.add_uplot(empty, tuple(series), title=title, scales={"x": {"time": False}}, axes=({}, {"size": 64}), height=150)
 
     def show(self, times: Iterable[float], values: Iterable[Sequence[float]]) -> None:
         """Shows values (k, number of curves) at times (k,), s."""
         rows = np.array(list(values), dtype=float).reshape(-1, len(self.chart.data) - 1)
+        rows = np.log10(rows) if self.log else rows  # the page's own logarithmic axis writes small values as 0
         self.chart.data = (np.array(list(times), dtype=float), *rows.T)
 
 
