@@ -105,6 +105,13 @@ def test_obstacles_may_overlap_each_other():
     assert findings(Solid(name="a", mesh=BOX, translation=(0, 5, 0)), obstacles=obstacles) == ""
 
 
+def test_an_obstacle_that_faces_inward_holds_what_is_inside():
+    inside = Solid(name="s", mesh=BOX, scale=0.5)
+    (finding,) = check(Scene(bodies=[inside], obstacles=[Obstacle(name="o", mesh=BOX)]))
+    assert str(finding).endswith("an obstacle that is to hold bodies must be open, or face inward (inward = true)")
+    assert not check(Scene(bodies=[inside], obstacles=[Obstacle(name="o", mesh=BOX, inward=True)]))
+
+
 @pytest.mark.parametrize(
     ("tets", "vertices", "message"),
     [

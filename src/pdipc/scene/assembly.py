@@ -424,6 +424,8 @@ def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[s
                     start = mesh.vertices
                 else:
                     mesh, start = load_mesh(placed, worker)
+                if isinstance(placed, Obstacle) and placed.inward:
+                    mesh.triangles = mesh.triangles[:, ::-1]
                 count = math.prod(placed.copies.counts) if isinstance(placed, Body) and placed.copies else 1
                 size = count * (BYTES_PER_BODY + BYTES_PER_VERTEX * len(start))
                 what = f"{count} copies of {len(start)} vertices" if count > 1 else f"{len(start)} vertices"

@@ -624,7 +624,11 @@ def _inside(assembly: Assembly, touching: set[tuple[int, int]]) -> Iterator[Find
             for vertex in parts[j]:
                 if np.all(low < x[vertex]) and np.all(x[vertex] < high) and winding_number(x[vertex], corners) > 0.5:
                     found = f"starts inside {_label(outer)}, at {_at(x[vertex])} m"
-                    right = "; an obstacle that is to hold bodies must face inward or be open" if outer.kinematic else ""
+                    right = (
+                        "; an obstacle that is to hold bodies must be open, or face inward (inward = true)"
+                        if outer.kinematic
+                        else ""
+                    )
                     yield Finding(_label(inner), found, "move it out" + right)
                     break
 

@@ -67,7 +67,7 @@ A mesh is one of
 
 A rod takes the lines between vertices: `l` of an OBJ file, L of `.npz`, `lines` of arrays, and the shapes `rope`, `ring`, `coil` and `knot`.
 A solid takes a mesh's tets; cloth and obstacles take its triangles, which for a mesh of tets are its surface. A closed obstacle
-whose triangles face outward is solid, so nothing may start inside it; one that faces inward is a container. Bodies must be
+whose triangles face outward is solid, so nothing may start inside it; one that faces inward (`inward = true` turns it) is a container. Bodies must be
 manifolds; obstacles need not be, and lose triangles without area or that repeat others.
 
 Quads and polygons, concave ones too, are cut into triangles, and hexahedra, wedges and pyramids into tets, alike on both sides of

@@ -839,6 +839,10 @@ class Obstacle(Placed):
         ]
         | None
     ) = Field(default=None, description="How it moves: rigidly, or with a cache of all its vertices; absent: not at all.")
+    inward: bool = Field(
+        default=False,
+        description="Turns its triangles to face the other way: a closed surface that is solid then holds what is inside.",
+    )
 
 
 # --- forces ---

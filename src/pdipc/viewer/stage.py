@@ -262,9 +262,14 @@ class Plot:
 
     def __init__(self, gui: Any, title: str, names: Sequence[str], log: bool = False):
         self.log = log
-        series = [{"label": "time, s"}, *({"label": name, "stroke": color, "width": 1.5} for name, color in zip(names, PALETTE, strict=False))]
+        series = [
+            {"label": "time, s"},
+            *({"label": name, "stroke": color, "width": 1.5} for name, color in zip(names, PALETTE, strict=False)),
+        ]
         empty = tuple(np.zeros(0) for _ in series)
-        self.chart = gui.add_uplot(empty, tuple(series), title=title, scales={"x": {"time": False}}, axes=({}, {"size": 64}), height=150)
+        self.chart = gui.add_uplot(
+            empty, tuple(series), title=title, scales={"x": {"time": False}}, axes=({}, {"size": 64}), height=150
+        )
 
     def show(self, times: Iterable[float], values: Iterable[Sequence[float]]) -> None:
         """Shows values (k, number of curves) at times (k,), s."""
