@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
-NEEDS = {"pictures": "pyvista", "rods": "pdipc", "rigid": "pdipc", "materials": "pdipc"}
+NEEDS = {"pictures": "pyvista", "rods": "pdipc", "rigid": "pdipc", "materials": "pdipc", "loads": "pdipc"}
 
 
 @pytest.mark.parametrize("page", NEEDS)

@@ -64,6 +64,12 @@ class Simulation(Controls):
         return self.state.positions.numpy().astype(np.float64)
 
     @property
+    @one_at_a_time
+    def velocities(self) -> np.ndarray:
+        """(n, 3) float64, m/s: at the end of the last step."""
+        return self.state.velocities.numpy().astype(np.float64)
+
+    @property
     def steps_done(self) -> int:
         """Steps since the start; a step may be several sub-steps."""
         return self.state.step // self.model.substeps
