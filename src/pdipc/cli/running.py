@@ -170,7 +170,7 @@ def _summary(folder: Path, seconds: float) -> None:
     from pdipc.output.summary import smallest_gap
 
     done = open_run(folder)
-    typer.echo(f"{folder}: {done.frame_count - 1} steps, {done.times[-1]:g} s simulated, {seconds:.1f} s of work")
+    typer.echo(f"{folder}: {done.frame_count - 1} steps, {done.times[-1]:g} s simulated, {seconds:.1f} s in all")
     typer.echo(f"smallest gap {metres(smallest_gap(done))}")
     stopped = sum(not record.get("converged", True) for record in done.stats)
     if stopped:

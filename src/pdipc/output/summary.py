@@ -47,7 +47,7 @@ def told_of(opened: "Run", steps: int) -> Iterator[str]:
     rest = {
         name: value
         for name, value in meta.items()
-        if name not in {*versions, "format", "device", "precision", "machine", "threads"}
+        if value and name not in {*versions, "format", "device", "precision", "machine", "threads"}
     }
     if rest:
         yield ", ".join(f"{name} {value}" for name, value in rest.items())
