@@ -69,5 +69,5 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    f = functions(real)
-    return tets.kernels(real, real.module(__name__), f.stress, f.principal, functions(real_of("float64")).density)
+    wide = functions(real_of("float64"))
+    return tets.kernels(real, real.module(__name__), wide.stress, functions(real).principal, wide.density)

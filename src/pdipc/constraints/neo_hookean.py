@@ -57,14 +57,24 @@ def functions(real: Real) -> SimpleNamespace:
 
     @wp.func
     def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
-        j = wp.determinant(f) - one
+        """Where J > 0, mu / 2 (|F|^2 - 3) - mu (J - 1) without the cancellation that would leave rounding of mu: in terms of
+        C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.
+        """
         half = scalar(0.5)
-        return half * mu * (wp.ddot(f, f) - scalar(3.0)) - mu * j + half * (lame + mu) * j * j
+        c = wp.transpose(f) * f - wp.identity(n=3, dtype=scalar)
+        trace = wp.trace(c)
+        minors = half * (trace * trace - wp.ddot(c, c)) + wp.determinant(c)
+        j = wp.determinant(f) - one
+        shear = half * trace - j
+        if j > -one:
+            j = (trace + minors) / (j + scalar(2.0))
+            shear = (half * trace * j - minors) / (j + scalar(2.0))
+        return mu * shear + half * (lame + mu) * j * j
 
     return SimpleNamespace(stress=stress, principal=principal, density=density)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    f = functions(real)
-    return tets.kernels(real, real.module(__name__), f.stress, f.principal, functions(real_of("float64")).density)
+    wide = functions(real_of("float64"))
+    return tets.kernels(real, real.module(__name__), wide.stress, functions(real).principal, wide.density)

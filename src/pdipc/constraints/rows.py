@@ -66,7 +66,7 @@ def kernels(
     element = wp.types.vector(corners, wp.int32)
     count = wp.constant(corners)
     blocks = wp.constant(corners * (corners + 1) // 2)
-    project, wide_project = project_of(real), project_of(real_of("float64"))
+    project = project_of(real_of("float64"))
     edges = tets.functions(real)
     wide = wp.float64
     slackens = wp.constant(1 if pulls else 0)
@@ -77,6 +77,13 @@ def kernels(
         total = vec3()
         for c in range(1, count):
             total += g[c] * edges.edge(base, u, v[0], v[c])
+        return total
+
+    @wp.func
+    def wide_combined(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: element, g: row) -> wp.vec3d:
+        total = wp.vec3d()
+        for c in range(1, count):
+            total += wide(g[c]) * edges.wide_edge(base, u, v[0], v[c])
         return total
 
     @named(module, "force")
@@ -93,10 +100,11 @@ def kernels(
     ):
         """w G^T (p - G x) at the corners."""
         e = first + wp.tid()
-        q = combined(base, u, vertices[e], g[e])
-        d = weight[e] * (project(q, length[e]) - q)
+        q = wide_combined(base, u, vertices[e], g[e])
+        d = project(q, wide(length[e])) - q
+        pull = weight[e] * vec3(scalar(d[0]), scalar(d[1]), scalar(d[2]))
         for c in range(count):
-            corners_out[offset + count * e + c] = g[e][c] * d
+            corners_out[offset + count * e + c] = g[e][c] * pull
 
     @named(module, "energy")
     def energy(
@@ -111,10 +119,8 @@ def kernels(
         energy_out: wp.array(dtype=wp.float64),
     ):
         e = first + wp.tid()
-        q = wp.vec3d()
-        for c in range(1, count):
-            q += wide(g[e][c]) * edges.wide_edge(base, u, vertices[e][0], vertices[e][c])
-        energy_out[offset + e] = wide(0.5) * wide(weight[e]) * wp.length_sq(q - wide_project(q, wide(length[e])))
+        q = wide_combined(base, u, vertices[e], g[e])
+        energy_out[offset + e] = wide(0.5) * wide(weight[e]) * wp.length_sq(q - project(q, wide(length[e])))
 
     if not bends:
         return SimpleNamespace(force=force, energy=energy)

@@ -1,5 +1,8 @@
 """Constraints on the deformation gradient of a tetrahedron: F = [x1 - x0, x2 - x0, x3 - x0] Dm^-1.
 
+Forces and energies are computed in double precision whatever the scene's: what rounding to float32 takes off a strain is a force, 6e-8 of the
+stiffness, that a stiff small body does not come to rest under. Hessians need no such care.
+
 A kind brings two functions. `stress(F, mu, lame)` is its first Piola-Kirchhoff stress over the weight. `principal(s, mu, lame)` is its
 energy's second derivative in terms of the signed singular values s of F = U diag(s) V^T (Smith, de Goes, Kim 2019, Analytic
 Eigensystems for Isotropic Distortion Energies): the 3x3 matrix W_ij over the stretches, and for each pair of axes, named by the
@@ -56,7 +59,7 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """Deformation gradients, and blocks of the Hessian."""
-    _scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
     eig, rot = eigen.functions(real), rotation.functions(real)
 
@@ -81,6 +84,14 @@ def functions(real: Real) -> SimpleNamespace:
             wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
             wide(a[1, 0]), wide(a[1, 1]), wide(a[1, 2]),
             wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
+        )  # fmt: skip
+
+    @wp.func
+    def narrowed(a: wide33) -> mat33:
+        return mat33(
+            scalar(a[0, 0]), scalar(a[0, 1]), scalar(a[0, 2]),
+            scalar(a[1, 0]), scalar(a[1, 1]), scalar(a[1, 2]),
+            scalar(a[2, 0]), scalar(a[2, 1]), scalar(a[2, 2]),
         )  # fmt: skip
 
     @wp.func
@@ -115,16 +126,18 @@ def functions(real: Real) -> SimpleNamespace:
         wide_edge=wide_edge,
         deformation=deformation,
         wide_deformation=wide_deformation,
+        widened=widened,
+        narrowed=narrowed,
         singular_values=singular_values,
         block=block,
     )
 
 
 def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable, density: Callable) -> SimpleNamespace:
-    """Force, energy and Hessian of tets. density(F, mu, lame): the energy over the weight, in double precision."""
+    """Force, energy and Hessian of tets. stress, and density(F, mu, lame), the energy over the weight: in double precision."""
     scalar, vec2, vec3, mat33 = real.scalar, real.vec2, real.vec3, real.mat33
     f_of, eig = functions(real), eigen.functions(real)
-    half, zero = wp.constant(scalar(0.5)), wp.constant(scalar(0.0))
+    half, zero, wide = wp.constant(scalar(0.5)), wp.constant(scalar(0.0)), wp.float64
 
     @named(module, "force")
     def force(
@@ -140,9 +153,9 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
     ):
         """-w G^T P(F) at the four corners."""
         e = first + wp.tid()
-        b = inverse[e]
-        f = f_of.deformation(base, u, vertices[e], b)
-        h = (-weight[e] * stress(f, modulus[e][0], modulus[e][1])) * wp.transpose(b)
+        f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
+        p = stress(f, wide(modulus[e][0]), wide(modulus[e][1]))
+        h = f_of.narrowed((-wide(weight[e]) * p) * wp.transpose(f_of.widened(inverse[e])))
         f1 = vec3(h[0, 0], h[1, 0], h[2, 0])
         f2 = vec3(h[0, 1], h[1, 1], h[2, 1])
         f3 = vec3(h[0, 2], h[1, 2], h[2, 2])
@@ -217,16 +230,15 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
 
 def projective(real: Real, module: wp.Module, project_of: Callable[[Real], Callable], principal: Callable) -> SimpleNamespace:
     """Kernels of a kind whose energy is |F - P|^2 / 2, P the projection of F: project_of(real) makes project(F) -> P."""
-    scalar, mat33 = real.scalar, real.mat33
-    project, wide_project = project_of(real), project_of(real_of("float64"))
+    project = project_of(real_of("float64"))
 
     @wp.func
-    def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
+    def stress(f: wp.mat33d, mu: wp.float64, lame: wp.float64) -> wp.mat33d:
         return f - project(f)
 
     @wp.func
     def density(f: wp.mat33d, mu: wp.float64, lame: wp.float64) -> wp.float64:
-        d = f - wide_project(f)
+        d = f - project(f)
         return wp.float64(0.5) * wp.ddot(d, d)
 
     return kernels(real, module, stress, principal, density)

@@ -198,7 +198,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     W_11, W_12, W_22, then what it costs to twist, to flip, and per axis to tilt out of the plane, W_i / s_i.
     """
     scalar, vec3, mat22, mat33 = real.scalar, real.vec3, real.mat22, real.mat33
-    project, wide_project = project_of(real), project_of(real_of("float64"))
+    project = project_of(real_of("float64"))
     f_of, own = functions(real), hessians(real)
 
     @named(module, "force")
@@ -215,10 +215,10 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         """w G^T (p - G x) at the three corners."""
         e = first + wp.tid()
         b = inverse[e]
-        f = f_of.deformation(base, u, vertices[e], b)
-        d = project(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2])) - f
-        d1 = weight[e] * vec3(d[0, 0], d[0, 1], d[0, 2])
-        d2 = weight[e] * vec3(d[1, 0], d[1, 1], d[1, 2])
+        f = f_of.wide_deformation(base, u, vertices[e], b)
+        d = project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
+        d1 = weight[e] * vec3(scalar(d[0, 0]), scalar(d[0, 1]), scalar(d[0, 2]))
+        d2 = weight[e] * vec3(scalar(d[1, 0]), scalar(d[1, 1]), scalar(d[1, 2]))
         g1 = b[0, 0] * d1 + b[0, 1] * d2
         g2 = b[1, 0] * d1 + b[1, 1] * d2
         corner = offset + 3 * e
@@ -239,7 +239,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     ):
         e = first + wp.tid()
         f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
-        d = wide_project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
+        d = project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.ddot(d, d)
 
     @named(module, "hessian")
