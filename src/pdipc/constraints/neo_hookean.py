@@ -1,9 +1,10 @@
-"""Stable neo-Hookean solids (Smith, de Goes, Kim 2018): finite and with a force that unfolds them where tets are flat or inverted.
+"""Stable neo-Hookean solids (Smith, de Goes, Kim 2018): finite, and with a force that unfolds them where tets are flat, inverted or a point.
 
-    W = mu / 2 (|F|^2 - 3) - mu (J - 1) + (lambda + mu) / 2 (J - 1)^2,     J = det F
+    W = m / 2 (|F|^2 - 3) - m / 2 log((|F|^2 + 1) / 4) - mu (J - 1) + k / 2 (J - 1)^2,     J = det F,
 
-Without the logarithm of the original, whose part is to keep rest at rest: here the middle term does. For small strains it is
-Hooke's law with mu and lambda. No local projection belongs to it, so it needs the Newton solver.
+with m = 4/3 mu and k = lambda + 5/6 mu, which for small strains is Hooke's law with mu and lambda. Without the logarithm a body squeezed below
+a fortieth of its volume would collapse to a point and stay: F = 0 would be a minimum. No local projection belongs to it, so it needs the Newton
+solver.
 """
 
 import functools
@@ -32,35 +33,38 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, mu, lame) -> Constrai
 def functions(real: Real) -> SimpleNamespace:
     """stress, principal and density, over mu; the argument `lame` is lambda / mu."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    one = wp.constant(scalar(1.0))
+    one, half = wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
+    m, shift = wp.constant(scalar(4.0 / 3.0)), wp.constant(scalar(5.0 / 6.0))
     cofactor = rotation.functions(real).cofactor
 
     @wp.func
     def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
         c = cofactor(f)
         j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
-        return mu * f + ((lame + mu) * (j - one) - mu) * c
+        spring = m * mu * (one - one / (wp.ddot(f, f) + one))
+        return spring * f + ((lame + shift * mu) * (j - one) - mu) * c
 
     @wp.func
     def principal(s: vec3, mu: scalar, lame: scalar):
         c = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-        k = lame + mu
+        k = lame + shift * mu
         pressure = k * (s[0] * c[0] - one) - mu
-        stretch = mat33(
-            mu + k * c[0] * c[0], k * c[0] * c[1] + pressure * s[2], k * c[0] * c[2] + pressure * s[1],
-            k * c[0] * c[1] + pressure * s[2], mu + k * c[1] * c[1], k * c[1] * c[2] + pressure * s[0],
-            k * c[0] * c[2] + pressure * s[1], k * c[1] * c[2] + pressure * s[0], mu + k * c[2] * c[2],
+        fade = one / (wp.dot(s, s) + one)
+        spring = m * mu * (one - fade)
+        stretch = k * wp.outer(c, c) + (scalar(2.0) * m * mu * fade * fade) * wp.outer(s, s) + mat33(
+            spring, pressure * s[2], pressure * s[1],
+            pressure * s[2], spring, pressure * s[0],
+            pressure * s[1], pressure * s[0], spring,
         )  # fmt: skip
         side = pressure * s
-        m = vec3(mu, mu, mu)
-        return stretch, m + side, m - side
+        each = vec3(spring, spring, spring)
+        return stretch, each + side, each - side
 
     @wp.func
     def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
-        """Where J > 0, mu / 2 (|F|^2 - 3) - mu (J - 1) without the cancellation that would leave rounding of mu: in terms of
+        """All terms of first order cancel at rest, and are left out where J > 0, since of them rounding of mu would be left: in terms of
         C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.
         """
-        half = scalar(0.5)
         c = wp.transpose(f) * f - wp.identity(n=3, dtype=scalar)
         trace = wp.trace(c)
         minors = half * (trace * trace - wp.ddot(c, c)) + wp.determinant(c)
@@ -69,7 +73,13 @@ def functions(real: Real) -> SimpleNamespace:
         if j > -one:
             j = (trace + minors) / (j + scalar(2.0))
             shear = (half * trace * j - minors) / (j + scalar(2.0))
-        return mu * shear + half * (lame + mu) * j * j
+        # y - log(1 + y), accurately where y is small
+        y = scalar(0.25) * trace
+        w = one + y
+        bent = scalar(0.0)
+        if w != one:
+            bent = y * (one - wp.log(w) / (w - one))
+        return mu * shear + half * m * mu * bent + half * (lame + shift * mu) * j * j
 
     return SimpleNamespace(stress=stress, principal=principal, density=density)
 

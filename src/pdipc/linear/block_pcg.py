@@ -118,18 +118,17 @@ class BlockPcg:
         rows = [m.offsets, m.columns, m.values, m.held]
         status = [self._first, self._left, self.iterations, self._residual, self._going]
         limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
-        self.device.launch(k.clear, m.count, [self._w])
-        if self.affine is not None:
-            self.affine.expand(p)
-        for c in couplings:
-            c.apply(p, self._w)
-        self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
-        if self.affine is not None:
-            self.affine.fold(self._r)
-        self._precondition()
-        sums.conclude(
-            k.begin, [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), *limits, *status, self.indefinite]
-        )
+
+        def begin(again: int) -> None:
+            self._find_residual(p, b, couplings)
+            if self.affine is not None:
+                self.affine.fold(self._r)
+            self._precondition()
+            numbers = [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), again]
+            sums.conclude(k.begin, [*numbers, *limits, *status, self.indefinite])
+
+        begin(again=0)
+        self.device.when(loose, lambda: self._move_rigidly(p) or begin(again=1))
 
         def iterate() -> None:
             if self.affine is not None:
@@ -147,6 +146,20 @@ class BlockPcg:
         self.device.loop(self._going, iterate)
         if self.affine is not None:
             self.affine.expand(p)
+
+    def _find_residual(self, p: wp.array, b: wp.array, couplings: list[Coupling]) -> None:
+        k, m = self._kernels, self.matrix
+        self.device.launch(k.clear, m.count, [self._w])
+        if self.affine is not None:
+            self.affine.expand(p)
+        for c in couplings:
+            c.apply(p, self._w)
+        rows = [m.offsets, m.columns, m.values, m.held]
+        self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
+
+    def _move_rigidly(self, p: wp.array) -> None:
+        """The coarse part of the preconditioned residual alone: what flies freely is solved by that exactly, whatever the tolerance."""
+        self.device.launch(self._kernels.move_rigidly, self.matrix.count, [self._unknown, self._inverse, self._r, self._u, p])
 
     def clear(self, values: wp.array) -> None:
         """Launches values = 0 over the vertices."""
@@ -238,12 +251,26 @@ def kernels(real: Real) -> SimpleNamespace:
         p_out[i] = vec3()
 
     @wp.kernel(module=module)
+    def move_rigidly(
+        first: int,
+        unknown: wp.array(dtype=wp.int32),
+        inverse: wp.array(dtype=mat33),
+        r: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        if unknown[i] == 1:
+            p[i] = p[i] + (u[i] - inverse[i] * r[i])
+
+    @wp.kernel(module=module)
     def begin(
         first: int,
         partial: wp.array(dtype=scalar),
         slots: int,
         numbers: wp.array(dtype=scalar),
         tolerated: scalar,
+        again: int,
         loose: wp.array(dtype=wp.int32),
         tolerance: scalar,
         most: int,
@@ -265,6 +292,8 @@ def kernels(real: Real) -> SimpleNamespace:
             if loose[0] != 0:
                 reference = scalar(LOOSE) * norm
             reference = wp.max(reference, tolerated / tolerance)
+            if again != 0:
+                reference = first_out[0]
             first_out[0] = reference
             left_out[0] = most
             residual_out[0] = norm / reference
@@ -351,6 +380,7 @@ def kernels(real: Real) -> SimpleNamespace:
         clear=clear,
         invert_diagonal=invert_diagonal,
         start=start,
+        move_rigidly=move_rigidly,
         begin=begin,
         find_alpha=find_alpha,
         multiply=multiply,

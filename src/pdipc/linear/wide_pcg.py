@@ -89,20 +89,22 @@ class WidePcg(BlockPcg):
         k, wide, device, m, modes = self._kernels, self._wide, self.device, self.matrix, self.modes
         rows = [m.offsets, m.columns, m.values, m.held]
         tolerance = self.real.scalar(tolerance or self.tolerance)
-        device.launch(k.clear, m.count, [self._w])
-        for c in couplings:
-            c.apply(p, self._w)
-        device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
         if not modes.chunks:
             return
-        modes.restrict(self._r)
         solved = [modes.groups, modes.chunks, modes.chunk_starts, modes.chunk_group, modes.members, modes.arms, modes.solved]
         correction = [*solved, modes.sums, self._inverse, self._r, self._u, self._gamma]
-        device.launch_blocks(wide.correct, modes.chunks, [self._flags, -1, *correction])
         status = [self._first, self._left, self.iterations, self._residual, self._going]
         limits = [loose, tolerance, self.most]
         numbers = [self._gamma, modes.chunks, self._numbers, self.real.scalar(tolerated)]
-        device.launch_blocks(k.begin, 1, [*numbers, *limits, *status, self.indefinite])
+
+        def begin(again: int) -> None:
+            self._find_residual(p, b, couplings)
+            modes.restrict(self._r)
+            device.launch_blocks(wide.correct, modes.chunks, [self._flags, -1, *correction])
+            device.launch_blocks(k.begin, 1, [*numbers, again, *limits, *status, self.indefinite])
+
+        begin(again=0)
+        device.when(loose, lambda: self._move_rigidly(p) or begin(again=1))
         device.launch(wide.begin, 1, [self._going, self._left, self._flags])
 
         operands = [o for c in couplings if (o := c.operand()) is not None]
