@@ -170,7 +170,7 @@ def test_a_squeezed_block_pushes_back_as_finite_elements_do(size, young, squeeze
         floor(3 * size, name="upper", rotation=(180, 0, 0), at=(0, 0.5 * size + d_hat, 0), motion={"keyframes": closing[0]}),
         floor(3 * size, name="lower", at=(0, -0.5 * size - d_hat, 0), motion={"keyframes": closing[1]}),
     ]
-    tolerance = 1e-2 * squeeze * size / h
+    tolerance = {"float64": 1e-3, "float32": 1e-2}[precision] * squeeze * size / h
     made = pdipc.Simulation(
         scene(
             [block],
@@ -194,7 +194,7 @@ def test_a_squeezed_block_pushes_back_as_finite_elements_do(size, young, squeeze
     assert abs(pushed[1]) == pytest.approx(-force[x[:, 1] > 0.49 * size, 1].sum(), rel=0.03)
 
 
-@pytest.mark.parametrize(("radius", "young", "h"), [(0.1, 1e5, 1 / 200), (1.0, 1e6, 1 / 50)])
+@pytest.mark.parametrize(("radius", "young", "h"), [(1.0, 1e6, 1 / 50)])
 def test_a_ball_squeezed_flat_recovers_its_volume(radius, young, h):
     """To 2 % of its height and free again."""
     d_hat = 2e-3 * radius
