@@ -2,18 +2,22 @@
 
 Small scenes of families that are made to break it, with every solver, both methods, both precisions and every culling. Every motion that
 an outer iteration commits is judged by brute force over all pairs, in exact arithmetic where rounding leaves a doubt
-(tests/collision/exact.py), and every state by the witness; motions must follow one another without a break. A breach is printed with the
-scene's family and number, from which `--family NAME --only NUMBER` makes it again.
+(tests/collision/exact.py), and every state by the witness; motions must follow one another without a break, what turns must be near its arc, and a run
+that is resumed must give the same bits. A breach is printed with the scene's family and number, from which `--family NAME --only NUMBER` makes it again.
 
 It must end with "breaches: 0". Scenes that are refused are counted, not judged. Writes benchmarks/results/attack.json.
 """
 
 import argparse
 import json
+import multiprocessing
+import os
+import subprocess
 import sys
 import time
 import warnings
 from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -316,15 +320,15 @@ class Judge:
         edges = edges[edges[:, 0] < edges[:, 1]]
         vertices = np.unique(triangles)
         faces = triangles[triangles[:, 1] != triangles[:, 2]]  # a rod's segment (a, b, b) is an edge
-        i, j = np.triu_indices(len(edges), 1)
-        self.quads = {
-            "vertex_triangle": np.column_stack([np.repeat(vertices, len(faces)), np.tile(faces, (len(vertices), 1))]),
-            "edge_edge": np.column_stack([edges[i], edges[j]]),
+        vertex, face = np.divmod(np.arange(len(vertices) * len(faces)), len(faces))
+        self.kinds = {
+            "vertex_triangle": (vertices[:, None], faces, vertex, face),
+            "edge_edge": (edges, edges, *np.triu_indices(len(edges), 1)),
         }
-        for kind, split in (("vertex_triangle", 1), ("edge_edge", 2)):
-            quads = self.quads[kind]
-            shared = (quads[:, :split, None] == quads[:, None, split:]).any(axis=(1, 2))
-            self.quads[kind] = quads[~shared & ~self.obstacle[quads].all(axis=1)]
+        for kind, (a, b, i, j) in self.kinds.items():
+            shared = (a[i][:, :, None] == b[j][:, None, :]).any(axis=(1, 2))
+            kept = ~shared & ~(self.obstacle[a[i, 0]] & self.obstacle[b[j, 0]])
+            self.kinds[kind] = a, b, i[kept], j[kept]
 
     def watch(self, simulation: pdipc.Simulation) -> None:
         """Goes on with this simulation."""
@@ -348,14 +352,17 @@ class Judge:
         if not np.isfinite(y).all():
             self.breaches.append(f"motion {self.motions} ends at what is not finite")
             return
-        low, high = np.minimum(x, y), np.maximum(x, y)
-        for (kind, quads), split in zip(self.quads.items(), (1, 2), strict=True):
-            a, b = quads[:, :split], quads[:, split:]
-            near = np.ones(len(quads), dtype=bool)
+        for kind, (a, b, i, j) in self.kinds.items():
+            bounds = [
+                (low[i], high[i], other_low[j], other_high[j]) for low, high, other_low, other_high in _bounds(x, y, a, b)
+            ]
+            apart = np.zeros(
+                len(i), dtype=bool
+            )  # on the same side along an axis at both ends, and so in between; nothing rounds here
             for axis in range(3):
-                near &= low[a, axis].min(axis=1) <= high[b, axis].max(axis=1)
-                near &= high[a, axis].max(axis=1) >= low[b, axis].min(axis=1)
-            chosen = quads[near]
+                apart |= np.all([low[:, axis] > other[:, axis] for low, _, _, other in bounds], axis=0)
+                apart |= np.all([high[:, axis] < other[:, axis] for _, high, other, _ in bounds], axis=0)
+            chosen = np.column_stack([a[i[~apart]], b[j[~apart]]])
             chosen = chosen[~self.excused(chosen[:, 0], chosen[:, 3])]
             self.pairs += len(chosen)
             if len(chosen):
@@ -385,6 +392,11 @@ class Judge:
                 own = np.linalg.norm(away, axis=1)[: np.count_nonzero(self.owner == mover.body)]
                 if own.max() > 4.0 * mover.deviation + least:
                     self.breaches.append(f"step {step}: {mover.label} is {own.max():.3g} m off its arc")
+
+
+def _bounds(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """The boxes of primitives a and b at x and at y: least and greatest of each."""
+    return [(p[a].min(axis=1), p[a].max(axis=1), p[b].min(axis=1), p[b].max(axis=1)) for p in (x, y)]
 
 
 def attack(family, number: int, seed: int) -> dict:
@@ -423,50 +435,60 @@ def attack(family, number: int, seed: int) -> dict:
     return outcome | {"breaches": judge.breaches, "motions": judge.motions, "pairs": judge.pairs, "seconds": seconds}
 
 
+def outcome_of(name: str, number: int, seed: int) -> dict:
+    """`attack`, or what went wrong with it."""
+    warnings.simplefilter("ignore")
+    try:
+        return attack(next(family for family in FAMILIES if family.__name__ == name), number, seed)
+    except Exception as error:
+        return {"family": name, "number": number, "error": f"{type(error).__name__}: {error}"}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=1000, help="scenes that are run, not counting refused ones")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=90.0)
+    parser.add_argument("--jobs", type=int, default=1, help="scenes at a time")
     parser.add_argument("--family", action="append", choices=[family.__name__ for family in FAMILIES])
     parser.add_argument("--only", type=int, help="this number of each family alone")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "attack.json")
     options = parser.parse_args()
-    warnings.simplefilter("ignore")
-    families = [family for family in FAMILIES if not options.family or family.__name__ in options.family]
+    names = [family.__name__ for family in FAMILIES if not options.family or family.__name__ in options.family]
+    git = ["git", "rev-parse", "HEAD"]
+    commit = subprocess.run(git, cwd=REPOSITORY, capture_output=True, text=True, check=False).stdout.strip()
     rows = defaultdict(lambda: {"scenes": 0, "refused": 0, "steps": 0, "motions": 0, "pairs": 0, "breaches": 0, "errors": 0})
     wrong, run, begun = [], 0, time.perf_counter()
     number = options.only or 0
-    while run < options.scenes and time.perf_counter() - begun < 60 * options.minutes:
-        for family in families:
-            row = rows[family.__name__]
-            try:
-                outcome = attack(family, number, options.seed)
-            except Exception as error:
-                row["errors"] += 1
-                wrong.append({"family": family.__name__, "number": number, "error": f"{type(error).__name__}: {error}"})
-                print("ERROR", json.dumps(wrong[-1]), flush=True)
-                continue
-            if outcome["refused"]:
-                row["refused"] += 1
-                if options.only is not None:
-                    print(outcome["refused"])
-                continue
-            run += 1
-            row["scenes"] += 1
-            for key in ("steps", "motions", "pairs"):
-                row[key] += outcome[key]
-            if outcome["breaches"]:
-                row["breaches"] += 1
-                wrong.append(outcome)
-                print("BREACH", json.dumps(outcome), flush=True)
-            elif options.only is not None:
-                print(json.dumps(outcome))
-        number += 1
-        seconds = time.perf_counter() - begun
-        print(f"{run} scenes in {seconds:.0f} s, breaches: {sum(row['breaches'] for row in rows.values())}", flush=True)
-        if options.only is not None:
-            return int(bool(wrong))
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        while run < options.scenes and time.perf_counter() - begun < 60 * options.minutes:
+            for outcome in pool.map(outcome_of, names, [number] * len(names), [options.seed] * len(names)):
+                row = rows[outcome["family"]]
+                if "error" in outcome:
+                    row["errors"] += 1
+                    wrong.append(outcome)
+                    print("ERROR", json.dumps(outcome), flush=True)
+                    continue
+                if outcome["refused"]:
+                    row["refused"] += 1
+                    if options.only is not None:
+                        print(outcome["refused"])
+                    continue
+                run += 1
+                row["scenes"] += 1
+                for key in ("steps", "motions", "pairs"):
+                    row[key] += outcome[key]
+                if outcome["breaches"]:
+                    row["breaches"] += 1
+                    wrong.append(outcome)
+                    print("BREACH", json.dumps(outcome), flush=True)
+                elif options.only is not None:
+                    print(json.dumps(outcome))
+            number += 1
+            seconds = time.perf_counter() - begun
+            print(f"{run} scenes in {seconds:.0f} s, breaches: {sum(row['breaches'] for row in rows.values())}", flush=True)
+            if options.only is not None:
+                return int(bool(wrong))
     for name, row in rows.items():
         print(f"{name:26}", "  ".join(f"{value:,} {key}" for key, value in row.items()))
     total = {
@@ -475,6 +497,8 @@ def main() -> int:
     }
     result = {
         "machine": machine(),
+        "load": os.getloadavg()[1],
+        "commit": commit,
         "seed": options.seed,
         "seconds": round(seconds),
         **total,
