@@ -367,3 +367,19 @@ def test_bodies_of_another_solver_are_followed_where_asked():
 
     run(solver, 3, move)
     assert solver._now.pose("body_0")[0] == pytest.approx([0.5, 0.0, 0.2], abs=1e-6)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_what_flies_so_far_that_float32_cannot_tell_it_apart_is_told_or_kept_apart(precision):
+    b = builder()
+    for z in (1.0, 1.001):
+        cloth(b, z, 2)
+    b.particle_qd = [(0.0, 0.0, 1e6)] * len(b.particle_q)
+    solver = solver_of(b, simulation={"precision": precision})
+    triangles = solver.model.tri_indices.numpy()
+    if precision == "float64":
+        with pytest.warns(UserWarning, match="from the origin, where states, which are float32, may intersect"):
+            run(solver, 1, h=1.0)
+    else:
+        _, (x,) = run(solver, 1, h=1.0)
+        assert not len(pdipc.find_intersections(x, triangles))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pdipc.simulation import Simulation
 
 HERE = 1e-6  # m, and part of a turn: a body that is no further from where it was told to be is there
+LOST = 2.0  # units in the last place; sqrt(3) in fact
 AT_ONCE = 1e9  # m/s: what leads obstacles and pins arrives within the step, as far as nothing is in the way
 
 
@@ -61,6 +62,7 @@ class SolverPDIPC(SolverBase):
         self._follow = follow_bodies
         self._simulations: dict[float, Simulation] = {}  # by time step
         self._now: Simulation | None = None
+        self._told = False  # of rounding
         self._translate()
         translate.warn(self._made.notes)
 
@@ -97,6 +99,7 @@ class SolverPDIPC(SolverBase):
         x, v = simulation.positions, simulation.state.velocities.numpy()
         new_q, new_qd = np.empty_like(q), np.empty_like(qd)
         new_q[self._particles], new_qd[self._particles] = x[: len(self._particles)], v[: len(self._particles)]
+        self._tell_of_rounding(x)
         _write(state_out, "particle_q", new_q)
         _write(state_out, "particle_qd", new_qd)
         for name in ("body_qd", "joint_q", "joint_qd"):
@@ -173,6 +176,21 @@ class SolverPDIPC(SolverBase):
                 f"contact.minimum_separation is {contact.minimum_separation:g} m, which the float32 of Newton's states does not keep at these "
                 f"coordinates; it must be at least {least:.3g} m"
             )
+
+    def _tell_of_rounding(self, x: np.ndarray) -> None:
+        """Warns, once, where particles have gone so far that the float32 of Newton's states can take the gap between them: each is rounded by half a
+        unit in the last place along each axis, which for two is less than LOST of them.
+        """
+        separation, farthest = self._made.scene.contact.minimum_separation, float(np.abs(x).max())
+        if self._told or separation is None or self._made.scene.simulation.precision == "float32":
+            return
+        if LOST * np.spacing(np.float32(farthest)) > separation:
+            self._told = True
+            note = (
+                f"particles are up to {farthest:.4g} m from the origin, where states, which are float32, may intersect though particles keep "
+                f'{separation:.3g} m; simulate nearer to the origin, or with simulation={{"precision": "float32"}}'
+            )
+            translate.warn([note])
 
     def _start(self) -> None:
         """What the last step left, and where bodies were led to: nothing moves yet."""
