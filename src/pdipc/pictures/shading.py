@@ -20,7 +20,7 @@ LAMP_TAPS, BLOCKER_TAPS, OPEN_TAPS = 48, 16, 32  # samples
 COARSE = 2  # pixels a side that share the samples of shade, which changes little from one to the next
 SAME_SURFACE = 0.1  # of the shade's radius: how far off the plane of a surface a point may be that counts to it
 LAMP_SIZE = 0.1  # tangent of the lamp's apparent radius
-STEEPEST = 6.0  # slope towards the lamp up to which the samples of a shadow follow a surface
+STEEPEST = 20.0  # slope towards the lamp up to which the samples of a shadow follow a surface
 ONE_SURFACE = 12.0  # a pixel shows one surface if its depth varies by less than so many of its sizes
 
 
@@ -164,7 +164,7 @@ def kernels() -> dict[str, wp.Kernel]:
     @wp.func
     def in_sight(lamp: _Lamp, here: wp.vec3f, normal: wp.vec3f, slack: float) -> float:
         """Part of the lamp that is in sight from `here`, where it is within `slack`, m."""
-        if wp.dot(normal, lamp.way) <= 0.02:
+        if wp.dot(normal, lamp.way) <= 1.0 / STEEPEST:
             return 1.0  # it gives no light here anyway
         deep = lamp.scale[2]
         whole = lamp.matrix * wp.vec4f(here[0], here[1], here[2], 1.0)
