@@ -1,5 +1,6 @@
 """Workers on Dask: on this machine or at a scheduler's address."""
 
+import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -46,7 +47,8 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
         with client:
             yield client
         return
-    share = str(max(1, cores() // workers))
+    share, log = str(max(1, cores() // workers)), logging.getLogger("distributed.nanny")
+    level = log.level
     with (
         # without a limit of memory: Dask would end a worker for using more than an even share
         LocalCluster(
@@ -55,6 +57,9 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
         Client(cluster) as client,
     ):
         yield client
+        # all is done: that a busy machine is slow to end the workers is nothing to warn of
+        log.setLevel(logging.ERROR)
+    log.setLevel(level)
 
 
 def each_of(
