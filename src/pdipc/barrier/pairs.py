@@ -522,7 +522,7 @@ class ActivePairs:
             if candidates.surface.has_faces and slot == 0:
                 device.launch_list(k.claim, c.capacity, [c.count, c.quads, c.limits, c.faces, c.gaps, c.found])
             device.scan(c.found, c.ends)
-            c.largest.max(c.closest, self.closest, slot)
+        candidates.largest.find([c.closest for c in candidates.lists], self.closest, [0, 1])
         ends = [c.ends for c in candidates.lists]
         device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
         for c in candidates.lists:

@@ -28,7 +28,7 @@ import warp as wp
 from pdipc.collision import distance, sieve
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
-from pdipc.device.launch import Device, Reducer, Span
+from pdipc.device.launch import Device, Largest, Span
 from pdipc.device.precision import Real
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
@@ -146,11 +146,6 @@ def kernels(real: Real) -> SimpleNamespace:
                     rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
                 limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
-    @wp.kernel(module=module)
-    def clear(first: int, away_out: wp.array(dtype=wp.int32)):
-        for i in range(4):
-            away_out[i] = 0
-
     @wp.func
     def near(x: vec3, y: vec3, margin: scalar) -> bool:
         """A comparison with NaN is false: what is not known to be near is away."""
@@ -179,8 +174,15 @@ def kernels(real: Real) -> SimpleNamespace:
             away[3] = 1
 
     @wp.kernel(module=module)
-    def decide(first: int, away: wp.array(dtype=wp.int32), needed_out: wp.array(dtype=wp.int32)):
+    def decide(
+        first: int, away: wp.array(dtype=wp.int32), needed_out: wp.array(dtype=wp.int32), renewed_out: wp.array(dtype=wp.int32)
+    ):
+        """Clears away for the next time."""
         needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
+        if needed_out[0] != 0:
+            renewed_out[0] = 1
+        for i in range(4):
+            away[i] = 0
 
     @wp.kernel(module=module)
     def keep(
@@ -197,7 +199,6 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(
         vertex_triangle_limits=vertex_triangle_limits,
         edge_edge_limits=edge_edge_limits,
-        clear=clear,
         depart=depart,
         decide=decide,
         keep=keep,
@@ -228,7 +229,6 @@ class CandidateList:
         self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
         self.gaps, self.times, self.faces = make(capacity, real.scalar), make(capacity, wp.int32), make(capacity, wp.int32)
         self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
-        self.largest = Reducer(self.device, real, blocks)
 
 
 class Candidates:
@@ -238,7 +238,7 @@ class Candidates:
     the device; what was listed is then incomplete, and the caller has to `grow` and list again.
     rest_separation: (n,) the part of its distance at rest that a pair of one body keeps at most, REST_SEPARATION where None.
     flat: (bodies,) int32, 1 where the faces of a body are flat; see `flatten`. ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
-    needed: (1,) int32 on the device, what `check` writes. generation: grows whenever arrays were replaced.
+    needed: (1,) int32 on the device, what `check` writes; renewed: (1,) int32, whether it has asked for a list since somebody took that back. generation: grows whenever arrays were replaced.
     """
 
     def __init__(
@@ -269,7 +269,7 @@ class Candidates:
         reach = (half_separation.numpy().astype(float) + (0.5 * activation_distance + margin)) * (1.0 + ROUNDING)
         self.reach = wp.array(reach, dtype=real.scalar, device=device.warp)
         self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
-        self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.needed, self.renewed = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(2))
         self.sieve = sieve.functions(real).Sieve()
         self.sieve.begin, self.sieve.end, self.sieve.reach = self.begin, self.end, self.reach
         self.overflow = broad_phase.overflow
@@ -283,6 +283,7 @@ class Candidates:
         for own, found in zip(self.lists, self.broad_phase.lists, strict=True):
             if self.generation == 0 or own.capacity != len(found.pairs):
                 own.allocate(found.count, len(found.pairs))
+        self.largest = Largest(self.device, self.real, [own.closest.size for own in self.lists])
         self.generation += 1
 
     def invalidate(self) -> None:
@@ -332,7 +333,6 @@ class Candidates:
         It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
         """
         k = self.kernels
-        self.device.launch_serial(k.clear, [self.away])
         inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), self.away]
         self.device.launch(k.depart, len(x0), inputs)
-        self.device.launch_serial(k.decide, [self.away, self.needed])
+        self.device.launch_serial(k.decide, [self.away, self.needed, self.renewed])

@@ -51,8 +51,10 @@ def kernels(real: Real):
         fixed: wp.array(dtype=wp.int32),
         near: wp.array(dtype=wp.int32),
         label_out: wp.array(dtype=wp.int32),
+        renewed_out: wp.array(dtype=wp.int32),
     ):
         """The least body of each body's island; fixed: what attachments join from the start."""
+        renewed_out[0] = 0
         for a in range(bodies):
             label_out[a] = fixed[a]
         for _ in range(bodies):  # as many as a chain of all of them takes
@@ -160,7 +162,12 @@ class Islands:
         device.launch(k.clear, self.count**2, [self._near])
         for c in candidates.lists:
             device.launch_list(k.connect, c.capacity, [c.count, c.quads, self.body, self.count, self._near])
-        device.launch_serial(k.label, [self.count, self._fixed, self._near, self.label])
+        device.launch_serial(k.label, [self.count, self._fixed, self._near, self.label, candidates.renewed])
+
+    def renew(self, candidates: Candidates) -> None:
+        """Launches the islands where pairs were listed since they were found."""
+        if self.count >= 2 and not self.together:
+            self.device.when(candidates.renewed, lambda: self.find(candidates))
 
     def find_driven(self, candidates: Candidates, u: wp.array, u_tilde: wp.array) -> None:
         """Launches `driven` for the motion u -> u_tilde."""

@@ -398,20 +398,53 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             total += partial[b]
         out[slot] = total
 
-    @wp.kernel(module=module)
-    def max_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
-        b = first + wp.tid()
-        largest = values[b * block]
-        for i in range(b * block, wp.min((b + 1) * block, count)):
-            largest = wp.max(largest, values[i])
-        partial_out[b] = largest
+    @wp.func
+    def one_of(which: int, i: int, a: wp.array(dtype=scalar), b: wp.array(dtype=scalar), c: wp.array(dtype=scalar)):
+        value = scalar(0.0)
+        if which == 0:
+            value = a[i]
+        elif which == 1:
+            value = b[i]
+        else:
+            value = c[i]
+        return value
 
     @wp.kernel(module=module)
-    def max_partials(first: int, partial: wp.array(dtype=scalar), slots: int, out: wp.array(dtype=scalar), slot: int):
-        largest = partial[0]
-        for b in range(slots):
-            largest = wp.max(largest, partial[b])
-        out[slot] = largest
+    def max_parts(
+        first: int,
+        a: wp.array(dtype=scalar),
+        b: wp.array(dtype=scalar),
+        c: wp.array(dtype=scalar),
+        counts: wp.vec3i,
+        blocks: int,
+        part: int,
+        partial_out: wp.array(dtype=scalar),
+    ):
+        """Largest values of `part` numbers a block of threads, of which each array has so many blocks."""
+        worker = first + wp.tid()
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        which = block // blocks
+        begin = wp.min((block - which * blocks) * part, counts[which] - 1)
+        largest = one_of(which, begin, a, b, c)
+        for i in range(begin + lane, wp.min(begin + part, counts[which]), wp.block_dim()):
+            largest = wp.max(largest, one_of(which, i, a, b, c))
+        largest = block_largest(largest)
+        if lane == 0:
+            partial_out[block] = largest
+
+    @wp.kernel(module=module)
+    def max_of_parts(first: int, partial: wp.array(dtype=scalar), blocks: int, slots: wp.vec3i, out: wp.array(dtype=scalar)):
+        """A block of threads for each array."""
+        worker = first + wp.tid()
+        which = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        largest = partial[which * blocks]
+        for k in range(lane, blocks, wp.block_dim()):
+            largest = wp.max(largest, partial[which * blocks + k])
+        largest = block_largest(largest)
+        if lane == 0:
+            out[slots[which]] = largest
 
     @wp.kernel(module=module)
     def wide_sum(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
@@ -424,24 +457,32 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         if worker % wp.block_dim() == 0:
             out[slot + worker // wp.block_dim()] = total
 
-    @wp.kernel(module=module)
-    def wide_max(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
-        worker = first + wp.tid()
-        largest = values[0]
-        for i in range(worker, count, stride):
-            largest = wp.max(largest, values[i])
-        largest = block_largest(largest)
-        if worker % wp.block_dim() == 0:
-            out[slot + worker // wp.block_dim()] = largest
-
     return {
         "sum_blocks": sum_blocks,
         "sum_partials": sum_partials,
-        "max_blocks": max_blocks,
-        "max_partials": max_partials,
+        "max_parts": max_parts,
+        "max_of_parts": max_of_parts,
         "wide_sum": wide_sum,
-        "wide_max": wide_max,
     }  # pyright: ignore[reportReturnType]
+
+
+class Largest:
+    """The largest numbers of up to three arrays on the device, in two launches. counts: how many numbers each has."""
+
+    def __init__(self, device: Device, real: Real, counts: Sequence[int]):
+        self.device, self.kernels, self.arrays = device, kernels(real), len(counts)
+        self.counts = wp.vec3i(*counts, *([1] * (3 - len(counts))))
+        self.part = max(REDUCE_BLOCK, -(-max(counts) // WIDE_BLOCKS)) if device.wide else REDUCE_BLOCK
+        self.blocks = max(1, -(-max(counts) // self.part))
+        self.partial = wp.zeros(self.arrays * self.blocks, dtype=real.scalar, device=device.warp)
+
+    def find(self, values: Sequence[wp.array], out: wp.array, slots: Sequence[int]) -> None:
+        """Launches out[slots[k]] = largest of values[k]."""
+        k, device, fill = self.kernels, self.device, 3 - self.arrays
+        inputs = [*values, *values[:1] * fill, self.counts, self.blocks, self.part, self.partial]
+        device.launch_blocks(k["max_parts"], self.arrays * self.blocks, inputs, grain=REDUCE_BLOCK // 8)
+        inputs = [self.partial, self.blocks, wp.vec3i(*slots, *[0] * fill), out]
+        device.launch_blocks(k["max_of_parts"], self.arrays, inputs, grain=1)
 
 
 class Reducer:
@@ -452,21 +493,19 @@ class Reducer:
         self.blocks = min(WIDE_BLOCKS, max(1, -(-count // BLOCK))) if device.wide else max(1, -(-count // REDUCE_BLOCK))
         self.partial = wp.zeros(self.blocks, dtype=real.scalar, device=device.warp)
         self.kernels = kernels(real)
+        self._largest = Largest(device, real, [count])
 
     def sum(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = sum of values[0:count], always in the same order on a device."""
-        self._reduce("sum", values, out, slot)
-
-    def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
-        """out[slot] = largest of values[0:count]."""
-        self._reduce("max", values, out, slot)
-
-    def _reduce(self, how: str, values: wp.array, out: wp.array, slot: int) -> None:
         k, device = self.kernels, self.device
         if device.wide:
             many = self.blocks * BLOCK
-            device.launch_blocks(k[f"wide_{how}"], self.blocks, [values, self.count, many, self.partial, 0])
-            device.launch_blocks(k[f"wide_{how}"], 1, [self.partial, self.blocks, BLOCK, out, slot])
+            device.launch_blocks(k["wide_sum"], self.blocks, [values, self.count, many, self.partial, 0])
+            device.launch_blocks(k["wide_sum"], 1, [self.partial, self.blocks, BLOCK, out, slot])
         else:
-            device.launch(k[f"{how}_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
-            device.launch_serial(k[f"{how}_partials"], [self.partial, self.blocks, out, slot])
+            device.launch(k["sum_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
+            device.launch_serial(k["sum_partials"], [self.partial, self.blocks, out, slot])
+
+    def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
+        """out[slot] = largest of values[0:count]."""
+        self._largest.find([values], out, [slot])

@@ -23,17 +23,22 @@ def kernels() -> SimpleNamespace:
         starts: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
         values: wp.array(dtype=wp.float64),
-        offset: int,
+        more: wp.array(dtype=wp.float64),
+        own: int,
         partial_out: wp.array(dtype=wp.float64),
     ):
+        """The first `own` blocks are of `values`, the others of `more`."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         total = wp.float64(0.0)
         for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
-            total += values[i]
+            if b < own:
+                total += values[i]
+            else:
+                total += more[i]
         total = block_total(total)
         if worker % wp.block_dim() == 0:
-            partial_out[offset + b] = total
+            partial_out[b] = total
 
     @wp.kernel(module=module)
     def add_bodies(
@@ -56,13 +61,11 @@ def kernels() -> SimpleNamespace:
 
 
 class BodySums:
-    """Adds up arrays whose entries belong to bodies. owners: for each array the body of every entry, -1 for none; bodies: how many."""
+    """Adds up one or two arrays whose entries belong to bodies. owners: for each array the body of every entry, -1 for none; bodies: how many."""
 
     def __init__(self, device: Device, owners: list[np.ndarray], bodies: int):
         self.device, self.bodies, self._kernels = device, bodies, kernels()
-        self._cuts: list[tuple[wp.array, wp.array, int, int]] = []
-        bodies_of_blocks = []
-        at = 0
+        cuts, bodies_of_blocks, at = [], [], 0
         for owner in owners:
             owner = np.asarray(owner)
             change = np.flatnonzero(np.diff(owner)) + 1
@@ -73,8 +76,10 @@ class BodySums:
             inside = owner[starts] >= 0 if len(starts) else np.zeros(0, dtype=bool)
             starts, ends = starts[inside], ends[inside]
             bodies_of_blocks.append(owner[starts] if len(starts) else np.zeros(0, dtype=np.int64))
-            self._cuts.append((self._upload(starts), self._upload(ends), at, len(starts)))
+            cuts.append((starts, ends))
             at += len(starts)
+        self._own, self._count = len(cuts[0][0]), at
+        self._starts, self._ends = (self._upload(np.concatenate(each)) for each in zip(*cuts, strict=True))
         body = np.concatenate([*bodies_of_blocks, np.zeros(0, dtype=np.int64)])
         order = np.argsort(body, kind="stable")
         self._offsets = wp.array(np.searchsorted(body[order], np.arange(bodies + 1)).astype(np.int32), device=device.warp)
@@ -86,10 +91,9 @@ class BodySums:
 
     def add(self, arrays: list[wp.array], total_out: wp.array) -> None:
         """Launches total_out[b] = sum of the entries of body b over all arrays."""
-        for values, (starts, ends, at, count) in zip(arrays, self._cuts, strict=True):
-            if count:
-                inputs = [starts, ends, values, at, self._partial]
-                self.device.launch_blocks(self._kernels.add_blocks, count, inputs, grain=BLOCK // 4)
+        if self._count:
+            inputs = [self._starts, self._ends, arrays[0], arrays[-1], self._own, self._partial]
+            self.device.launch_blocks(self._kernels.add_blocks, self._count, inputs, grain=BLOCK // 4)
         if self.bodies:
             inputs = [self._offsets, self._blocks, self._partial, total_out]
             self.device.launch_blocks(self._kernels.add_bodies, self.bodies, inputs, grain=1)

@@ -34,7 +34,7 @@ from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.collision.islands import Islands
 from pdipc.device import blocks
-from pdipc.device.launch import Reducer
+from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
 from pdipc.integration import status
@@ -100,20 +100,16 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         h: scalar,
         damping: scalar,
+        beside: wp.array(dtype=wide),
         force_out: wp.array(dtype=vec3),
         energy_out: wp.array(dtype=wide),
     ):
-        """-dE/du and E of each vertex (line 8), with mass-proportional damping."""
+        """-dE/du of each vertex (line 8), with mass-proportional damping, and E with what is beside it."""
         i = first + wp.tid()
         scale = free[i] * mass[i] / h
         force_out[i] = scale / h * (z[i] - u[i]) - scale * damping * (u[i] - rest[i])
         energy = wide(scale) / wide(h) * wide_square(u[i], z[i]) + wide(scale) * wide(damping) * wide_square(u[i], rest[i])
-        energy_out[i] = wide(0.5) * energy
-
-    @wp.kernel(module=module)
-    def add(first: int, a: wp.array(dtype=wide), b: wp.array(dtype=wide), sum_out: wp.array(dtype=wide)):
-        i = first + wp.tid()
-        sum_out[i] = a[i] + b[i]
+        energy_out[i] = wide(0.5) * energy + beside[i]
 
     @wp.kernel(module=module)
     def begin(
@@ -543,9 +539,11 @@ def kernels(real: Real) -> SimpleNamespace:
         passes: wp.array(dtype=wp.int32),
         hits_out: wp.array(dtype=wp.int32),
         attempts_out: wp.array(dtype=wp.int32),
+        count_out: wp.array(dtype=wp.int32),
     ):
         hits_out[0] = passes[0]
         attempts_out[0] = 0
+        count_out[status.MOVING] = 0
 
     @wp.kernel(module=module)
     def decide(
@@ -639,10 +637,6 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
             count[status.MOVING] = 1
 
-    @wp.kernel(module=module)
-    def clear_motion(first: int, count: wp.array(dtype=wp.int32)):
-        count[status.MOVING] = 0
-
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 
 
@@ -710,7 +704,7 @@ class Newton:
         self.whole = upload([free[low:high].all() for low, high in ranges])
         vec3, scalar = real.vec3, real.scalar
         self.inertial, self.rhs, self.p = zeros(vec3), zeros(vec3), zeros(vec3, n + 1)
-        self.inertial_energy, self.vertex_energy = zeros(wp.float64), zeros(wp.float64)
+        self.vertex_energy = zeros(wp.float64)
         self.moved, self.forces, self.scales, self.lags = (zeros(scalar) for _ in range(4))
         self.numbers = zeros(scalar, status.NUMBERS)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
@@ -731,7 +725,7 @@ class Newton:
         self.nobody = zeros(wp.int32, len(work.script.movers))
         self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest = Reducer(device, real, n)
+        self.largest, self.largest_of_three = Largest(device, real, [n]), Largest(device, real, [n, n, n])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -785,8 +779,7 @@ class Newton:
         self.pairs.freeze(w.candidates, x)
         self.pairs.differentiate(x)
         inputs = [u, w.rest, w.z, self.model.mass, self.model.free, real.scalar(s.time_step), real.scalar(s.damping)]
-        device.launch(k.inertia, n, [*inputs, self.inertial, self.inertial_energy])
-        device.launch(k.add, n, [self.inertial_energy, self.pairs.energy_of_vertex, self.vertex_energy])
+        device.launch(k.inertia, n, [*inputs, self.pairs.energy_of_vertex, self.inertial, self.vertex_energy])
         self.model.projector.evaluate(w.x_start, u)
         self._sum_energies()
         if self.friction is not None:
@@ -841,9 +834,8 @@ class Newton:
         inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial, self.islands.body, self.center, self.turn]
         inputs += [w.script.target, w.script.mover, w.script.drive]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
-        self.largest.max(self.moved, self.numbers, status.MOVED)
-        self.largest.max(self.forces, self.numbers, status.FORCE)
-        self.largest.max(self.scales, self.numbers, status.FORCE_SCALE)
+        wanted = [self.moved, self.forces, self.scales]
+        self.largest_of_three.find(wanted, self.numbers, [status.MOVED, status.FORCE, status.FORCE_SCALE])
 
     def _assemble(self) -> None:
         self.matrix.restrain(self.islands.body, self.restraint)
@@ -903,9 +895,8 @@ class Newton:
             self.model,
             self.work.truncation,
         )
-        device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts])
-        self.islands.find(w.candidates)
-        device.launch_serial(k.clear_motion, [w.count])
+        device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts, w.count])
+        self.islands.renew(w.candidates)
         if w.script.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
@@ -939,7 +930,7 @@ class Newton:
         device.loop(self.searching, search)
         inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
-        self.largest.max(self.lags, self.numbers, status.LAG)
+        self.largest.find([self.lags], self.numbers, [status.LAG])
         self._keep_energies()
         if w.script.moves:
             p = self.pairs
