@@ -111,7 +111,9 @@ def test_an_iteration_of_conjugate_gradients_is_three_launches():
     _, work = after_a_step(stack(), place)
     names = Counter(name_of(kernel) for kernel, *_ in place.launches if "wide_pcg" in kernel.module.name)
     assert names["multiply"] == names["advance"] > 0
-    assert names["correct"] - names["advance"] == names["begin"]  # one at the start of a solve
+    assert (
+        names["begin"] <= names["correct"] - names["advance"] <= 2 * names["begin"]
+    )  # at the start of a solve; again in free flight
     assert names["advance"] >= int(work.method.iterations.numpy()[0])
 
 
