@@ -106,3 +106,19 @@ def test_a_wrapped_count_is_an_overflow():
     found.found.assign(np.array([2**31 - 1, 2**31 - 1, 5], dtype=np.int32))
     with pytest.raises(MemoryError, match="4294967299 candidate pairs"):
         found.grow()
+
+
+def test_what_was_too_much_once_is_remembered(monkeypatch):
+    """A search within a step may end where fewer pairs are active than where the list was full."""
+    monkeypatch.setattr(pairs, "FIRST_PAIRS", 1)
+    block = solid("block", [0.1, 0.1, 0.1], [3, 3, 3], at=(0, 0.051, 0))
+    work = Work(pdipc.build(scene([block], [floor(2.0)], contact={"activation_distance": 3e-3}), "cpu"))
+    far = wp.clone(work.x)
+    far.assign(work.x.numpy() + [0.0, 1.0, 0.0] * work.model.free_vertices[:, None])
+    work.candidates.cover(work.x, work.x)
+    work.candidates.grow()
+    work.candidates.cover(work.x, work.x)
+    work.pairs.freeze(work.candidates, work.x)
+    work.pairs.freeze(work.candidates, far)
+    assert work.pairs.count.numpy()[0] == 0
+    assert work.pairs.grow() and work.pairs.capacity >= 16  # the vertices of its bottom

@@ -4,7 +4,7 @@ A floor of many triangles is one polygon. Were each of them to push by itself, a
 edges between them, which are not there: a ball would roll over bumps. So a face counts once: a vertex has the barrier of the nearest
 triangle of a face alone, and edges and vertices *inside* of a face have none.
 
-**Nothing is lost.** Where something comes near an inner edge or vertex, a pair that counts is as near. What comes is a segment or a triangle. Over
+**Nothing is lost.** Where something comes near an inner edge or vertex, a pair that counts is as near. What comes is a segment, a triangle or a flat face. Over
 its part above the face, a convex polygon, the height above the plane is linear, so it is least at a corner: a vertex above the face
 (vertex-triangle), an edge above an edge of the face's border (edge-edge), or a point above a corner of the face (vertex-triangle), all of which
 count. So the potential still grows without bound before anything touches. CCD knows nothing of faces, and proves every pair.
