@@ -77,14 +77,14 @@ def test_without_a_gpu_it_says_so():
 
 
 def test_prediction(monkeypatch):
-    """Three launches an iteration; what waits and what moves add up; a slower memory takes longer, and more iterations do."""
+    """Three launches an iteration; no step is faster than its launches or its bytes; a slower memory takes no less, more iterations take longer."""
     monkeypatch.syspath_prepend(str(Path(COMMAND[1]).parent))
     import gpu_predict
 
     row = {"outer": 3.0, "linear_iterations": 40.0, "truncations": 0.0, "barriers": 100.0, "mean ms": 1.0}
     found = gpu_predict.predict("s2_2", row)
     assert found["an iteration"] == 3
-    assert found["H100"] == pytest.approx(found["waits ms"] + 1e3 * found["GB"] / 2958)
-    assert found["RTX 3090"] > found["H100"] > 1e3 * gpu_predict.LAUNCH * found["launches"]
+    assert found["RTX 3090"] >= found["H100"] > 1e3 * gpu_predict.LAUNCH * found["launches"] + found["memory ms"]
     more = gpu_predict.predict("s2_2", row | {"linear_iterations": 140.0})
     assert more["launches"] - found["launches"] == pytest.approx(300)
+    assert more["H100"] > found["H100"]
