@@ -66,7 +66,7 @@ class Problem:
 
 
 def measure(name):
-    of = getattr(distance.functions(real("float64")), f"{name}_distance")
+    of = getattr(distance, f"{name}_distance")
 
     def distances(x: wp.array(dtype=wp.vec3d), quads: wp.array(dtype=wp.vec4i), out: wp.array(dtype=wp.float64)):
         q = quads[wp.tid()]

@@ -8,25 +8,21 @@ import warp as wp
 
 from collision import hard_queries
 from pdipc.collision import cubic
-from pdipc.device.precision import real as real_of
 
-PRECISIONS = ("float64", "float32")
 NEVER = cubic.NEVER
 
 
-def first_roots(coefficients, precision="float64", margin=0.0, tolerance=1e-3):
-    real = real_of(precision)
-    functions = cubic.functions(real)
+@wp.kernel(enable_backward=False, module="unique")
+def find_roots(k: wp.array(dtype=wp.vec4d), margin: wp.float64, tolerance: wp.float64, out: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    out[i] = cubic.first_root(k[i], margin, tolerance)
 
-    @wp.kernel(module=real.module(f"{__name__}.root"))
-    def kernel(k: wp.array(dtype=real.vec4), margin: real.scalar, tolerance: real.scalar, out: wp.array(dtype=real.scalar)):
-        i = wp.tid()
-        out[i] = functions.first_root(k[i], margin, tolerance)
 
-    k = wp.array(np.asarray(coefficients), dtype=real.vec4, device="cpu")
-    out = wp.zeros(len(k), dtype=real.scalar, device="cpu")
-    wp.launch(kernel, len(k), [k, margin, tolerance, out], device="cpu")
-    return out.numpy().astype(float)
+def first_roots(coefficients, margin=0.0, tolerance=1e-3):
+    k = wp.array(np.asarray(coefficients), dtype=wp.vec4d, device="cpu")
+    out = wp.zeros(len(k), dtype=wp.float64, device="cpu")
+    wp.launch(find_roots, len(k), [k, margin, tolerance, out], device="cpu")
+    return out.numpy()
 
 
 def exceeds(coefficients, margin, time) -> bool:
@@ -80,14 +76,13 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_cases(case, precision):
+def test_cases(case):
     """The three cases of Section 6, and those it leaves out: the root from below, none where there is none."""
     coefficients, root = CASES[case]
     if case == "A < 0, interval III after I without a root":
         root = max(np.roots(coefficients).real)
         assert np.isreal(np.roots(coefficients)).sum() == 1 and root < 1
-    (t,) = first_roots([coefficients], precision, tolerance=1e-6)
+    (t,) = first_roots([coefficients], tolerance=1e-6)
     if root is None:
         assert t == NEVER
     else:
@@ -103,8 +98,7 @@ def first_real_root(coefficients) -> float:
     return min(real[(real >= 0) & (real <= 1)], default=NEVER)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_never_past_the_root(precision):
+def test_never_past_the_root():
     """Random and near-degenerate cubics: the answer is proven by exact arithmetic, and most roots are met closely."""
     rng = np.random.default_rng(0)
     n = 400
@@ -112,10 +106,8 @@ def test_never_past_the_root(precision):
     roots[: n // 4, 1] = roots[: n // 4, 0] + 10.0 ** rng.uniform(-12, -2, n // 4)  # nearly double
     cubics = np.array([from_roots(*r) for r in roots]) * rng.choice([-1, 1], (n, 1))
     cubics[n // 2 : 3 * n // 4] = rng.normal(size=(n // 4, 4)) * 10.0 ** rng.uniform(-9, 0, (n // 4, 4))
-    cubics = cubics.astype(precision)
-    margin = np.float32(1e-4)
-    for least in (0.0, float(margin)):
-        times = first_roots(cubics, precision, margin=least)
+    for least in (0.0, 1e-4):
+        times = first_roots(cubics, margin=least)
         for k, t in zip(cubics, times, strict=True):
             assert t == 0 or exceeds(k, least, min(t, 1.0)), (k, t)
         if least:
@@ -141,35 +133,34 @@ def exact_coefficients(u0, v0, w0, u1, v1, w1):
     ]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_coefficients_are_within_their_error(precision):
+@wp.kernel(enable_backward=False, module="unique")
+def find_coefficients(
+    x: wp.array(dtype=wp.vec3d, ndim=2), k_out: wp.array(dtype=wp.vec4d), error_out: wp.array(dtype=wp.float64)
+):
+    i = wp.tid()
+    a0 = x[i, 1] - x[i, 0]
+    b0 = x[i, 2] - x[i, 0]
+    c0 = x[i, 3] - x[i, 0]
+    a1 = x[i, 5] - x[i, 4]
+    b1 = x[i, 6] - x[i, 4]
+    c1 = x[i, 7] - x[i, 4]
+    size = wp.float64(0.0)
+    for j in range(4):
+        size = wp.max(size, wp.max(wp.max(wp.abs(x[i, j] - x[i, 0])), wp.max(wp.abs(x[i, 4 + j] - x[i, 4]))))
+    k_out[i] = cubic.coefficients(b0 - a0, c0 - a0, a0, b1 - a1, c1 - a1, a1)
+    error_out[i] = cubic.coefficient_error(b0 - a0, c0 - a0, a0, b1 - a1, c1 - a1, a1, size)
+
+
+def test_coefficients_are_within_their_error():
     """Lemma 3, where it is hardest: small primitives far from the origin, slivers, everything in one plane."""
-    real = real_of(precision)
-    functions = cubic.functions(real)
-
-    @wp.kernel(module=real.module(f"{__name__}.coefficients"))
-    def kernel(x: wp.array(dtype=real.vec3, ndim=2), k_out: wp.array(dtype=real.vec4), error_out: wp.array(dtype=real.scalar)):
-        i = wp.tid()
-        a0 = x[i, 1] - x[i, 0]
-        b0 = x[i, 2] - x[i, 0]
-        c0 = x[i, 3] - x[i, 0]
-        a1 = x[i, 5] - x[i, 4]
-        b1 = x[i, 6] - x[i, 4]
-        c1 = x[i, 7] - x[i, 4]
-        size = real.scalar(0.0)
-        for j in range(4):
-            size = wp.max(size, wp.max(wp.max(wp.abs(x[i, j] - x[i, 0])), wp.max(wp.abs(x[i, 4 + j] - x[i, 4]))))
-        k_out[i] = functions.coefficients(b0 - a0, c0 - a0, a0, b1 - a1, c1 - a1, a1)
-        error_out[i] = functions.coefficient_error(b0 - a0, c0 - a0, a0, b1 - a1, c1 - a1, a1, size)
-
-    underflow = Fraction({"float32": 1e-40, "float64": 1e-300}[precision])  # such volumes are not used
+    underflow = Fraction(1e-300)  # such volumes are not used
     worst = 0.0
     for seed, family in enumerate(hard_queries.FAMILIES):
-        points = family(np.random.default_rng(seed), 30).astype(precision)
-        k = wp.zeros(len(points), dtype=real.vec4, device="cpu")
-        error = wp.zeros(len(points), dtype=real.scalar, device="cpu")
-        x = wp.array(points, dtype=real.vec3, ndim=2, device="cpu")
-        wp.launch(kernel, len(points), [x, k, error], device="cpu")
+        points = family(np.random.default_rng(seed), 30)
+        k = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
+        error = wp.zeros(len(points), dtype=wp.float64, device="cpu")
+        x = wp.array(points, dtype=wp.vec3d, ndim=2, device="cpu")
+        wp.launch(find_coefficients, len(points), [x, k, error], device="cpu")
         for query, computed, bound in zip(points, k.numpy(), error.numpy(), strict=True):
             y = [[Fraction(float(v)) for v in row] for row in query]
             a0, b0, c0, a1, b1, c1 = ([p - q for p, q in zip(y[i], y[j], strict=True)] for i, j in

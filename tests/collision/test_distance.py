@@ -17,16 +17,15 @@ KINDS = ("vertex_triangle", "edge_edge")
 def measure(points: np.ndarray, kind: str, precision: str):
     """(distances (n,), weights (n, 4)) of points (n, 4, 3)."""
     real = real_of(precision)
-    functions = distance.functions(real)
-    distance_of, weights_of = getattr(functions, f"{kind}_distance"), getattr(functions, f"{kind}_weights")
+    distance_of, weights_of = getattr(distance, f"{kind}_distance"), getattr(distance, f"{kind}_weights")
 
     @wp.kernel(module=real.module(f"{__name__}.{kind}"))
     def kernel(
         x: wp.array(dtype=real.vec3, ndim=2), distance_out: wp.array(dtype=real.scalar), weights_out: wp.array(dtype=real.vec4)
     ):
         i = wp.tid()
-        distance_out[i] = distance_of(x[i, 0], x[i, 1], x[i, 2], x[i, 3])
-        weights_out[i] = weights_of(x[i, 0], x[i, 1], x[i, 2], x[i, 3])
+        distance_out[i] = real.scalar(distance_of(x[i, 0], x[i, 1], x[i, 2], x[i, 3]))
+        weights_out[i] = real.vec4(weights_of(x[i, 0], x[i, 1], x[i, 2], x[i, 3]))
 
     x = wp.array(points, dtype=real.vec3, ndim=2, device="cpu")
     distances = wp.zeros(len(points), dtype=real.scalar, device="cpu")

@@ -30,7 +30,6 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     mat43 = wp.types.matrix((4, 3), scalar)
     module = real.module(__name__)
-    bar = barrier.functions(real)
     zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
 
     @wp.func
@@ -63,6 +62,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 d1[3] = -one
         return d1, d2
 
+    # Long: energy, gradient and Hessian of a pair, which share all that is computed of it.
     @wp.kernel(module=module)
     def differentiate(
         span: Span,
@@ -91,8 +91,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 d = gaps[k]
                 d_hat = activation[k]
                 km = stiffness[k]
-                b1 = bar.barrier_gradient(d, d_hat)
-                b2 = bar.barrier_hessian(d, d_hat)
+                b1 = barrier.barrier_gradient(d, d_hat)
+                b2 = barrier.barrier_hessian(d, d_hat)
                 slope = mat43()
                 lever = mat43()
                 hessian = km * b2
@@ -105,17 +105,17 @@ def kernels(real: Real) -> SimpleNamespace:
                 bend = zero
                 first_bent = mat43()
                 second_bent = mat43()
-                energy = wp.float64(km) * bar.wide_barrier(wp.float64(d), wp.float64(d_hat))
+                energy = wp.float64(km) * barrier.barrier(wp.float64(d), wp.float64(d_hat))
                 plain = True
                 if k >= count[2]:
                     e1 = x[q[1]] - x[q[0]]
                     e2 = x[q[3]] - x[q[2]]
-                    c, g1, g2 = bar.parallel_gradient(e1, e2)
+                    c, g1, g2 = barrier.parallel_gradient(e1, e2)
                     if c < one and c > zero:
                         plain = False
                         m = c * (two - c)
                         kappa = km / m
-                        b0 = bar.barrier(d, d_hat)
+                        b0 = barrier.barrier(d, d_hat)
                         slant = two - two * c
                         # the two gradients: a n, and that of c, which is (-g1, g1, -g2, g2)
                         turn = mat43(
@@ -236,6 +236,7 @@ def kernels(real: Real) -> SimpleNamespace:
         diagonal_out[v] = d
         energy_out[v] = own
 
+    # Arguments: a pair as it is frozen, and where its part goes.
     @wp.func
     def feel(
         k: int,

@@ -23,7 +23,6 @@ from pdipc.linear.wide_pcg import Operator
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
-    bar = barrier.functions(real)
     zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
 
     @wp.kernel(module=module)
@@ -50,7 +49,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 quads_out[k] = quads[k]
                 weights_out[k] = weights[k]
                 normals_out[k] = normals[k]
-                limit_out[k] = -coefficient[k] * stiffness[k] * bar.barrier_gradient(gaps[k], activation[k])
+                limit_out[k] = -coefficient[k] * stiffness[k] * barrier.barrier_gradient(gaps[k], activation[k])
                 for s in range(4):
                     entries_out[4 * k + s] = entries[4 * k + s]
 
@@ -104,7 +103,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 n = normals[k]
                 s = slip(quads[k], weights[k], n, u)
                 size = wp.length(s)
-                rate = limit[k] * bar.smoothed_coulomb(size, threshold)
+                rate = limit[k] * barrier.smoothed_coulomb(size, threshold)
                 y = size / threshold
                 length = size
                 along = zero

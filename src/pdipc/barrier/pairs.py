@@ -34,7 +34,6 @@ LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
-    dist, bar = distance.functions(real), barrier.functions(real)
     far = wp.constant(real.scalar(1.0e30))
     least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
     silent = wp.constant(SILENT)
@@ -48,7 +47,7 @@ def kernels(real: Real) -> SimpleNamespace:
         apart = wp.max(wp.max(wp.min(wp.min(a, b), c) - p, p - wp.max(wp.max(a, b), c)))
         if apart >= limits[0] + limits[1]:
             return far
-        w = dist.vertex_triangle_weights(p, a, b, c)
+        w = vec4(distance.vertex_triangle_weights(p, a, b, c))
         return wp.length(w[0] * (p - a) + w[2] * (b - a) + w[3] * (c - a)) - limits[0]
 
     @wp.func
@@ -60,7 +59,7 @@ def kernels(real: Real) -> SimpleNamespace:
         apart = wp.max(wp.max(wp.min(b0, b1) - wp.max(a0, a1), wp.min(a0, a1) - wp.max(b0, b1)))
         if apart >= limits[0] + limits[1]:
             return far
-        w = dist.edge_edge_weights(a0, a1, b0, b1)
+        w = vec4(distance.edge_edge_weights(a0, a1, b0, b1))
         return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
 
     def measure(kind: str, gap_of):
@@ -205,10 +204,10 @@ def kernels(real: Real) -> SimpleNamespace:
                         m = scalar(1.0)
                         a = vec4()
                         if wp.static(edge_edge):
-                            a = dist.edge_edge_weights(zero, p1, p2, p3)
-                            m = bar.mollifier(zero, p1, p2, p3)
+                            a = vec4(distance.edge_edge_weights(zero, p1, p2, p3))
+                            m = barrier.mollifier(zero, p1, p2, p3)
                         else:
-                            a = dist.vertex_triangle_weights(zero, p1, p2, p3)
+                            a = vec4(distance.vertex_triangle_weights(zero, p1, p2, p3))
                         r = a[1] * p1 + a[2] * p2 + a[3] * p3
                         n = wp.normalize(r)
                         d0 = gaps[k]
@@ -318,8 +317,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 move += a[2] * (x_tilde[q[2]] - x[q[2]]) + a[3] * (x_tilde[q[3]] - x[q[3]])
                 delta = gaps[k] + wp.dot(n, move)
                 floor = scalar(barrier.EXTENSION) * gaps[k]
-                hessian_out[k] = stiffness[k] * bar.barrier_hessian(wp.max(delta, floor), activation[k])
-                f = stiffness[k] * bar.extended_gradient(delta, floor, activation[k])
+                hessian_out[k] = stiffness[k] * barrier.barrier_hessian(wp.max(delta, floor), activation[k])
+                f = stiffness[k] * barrier.extended_gradient(delta, floor, activation[k])
                 # `force` is what the pair exerts, per unit of witness weight: barrier along n, friction across
                 force = -f * n
                 friction = scalar(0.0)
@@ -327,7 +326,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     u = a[0] * (x_tilde[q[0]] - x_start[q[0]]) + a[1] * (x_tilde[q[1]] - x_start[q[1]])
                     u += a[2] * (x_tilde[q[2]] - x_start[q[2]]) + a[3] * (x_tilde[q[3]] - x_start[q[3]])
                     u -= wp.dot(u, n) * n
-                    friction = -coefficient[k] * f * bar.smoothed_coulomb(wp.length(u), slip_threshold)
+                    friction = -coefficient[k] * f * barrier.smoothed_coulomb(wp.length(u), slip_threshold)
                     force -= friction * u
                 friction_out[k] = friction
                 force_out[k] = force
@@ -420,7 +419,7 @@ def kernels(real: Real) -> SimpleNamespace:
         k = first + wp.tid()
         energy_out[k] = scalar(0.0)
         if k < count[0]:
-            energy_out[k] = stiffness[k] * bar.barrier(gaps[k], activation[k])
+            energy_out[k] = stiffness[k] * barrier.barrier(gaps[k], activation[k])
 
     return SimpleNamespace(
         total=total,

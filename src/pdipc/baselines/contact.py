@@ -175,6 +175,7 @@ class DistanceBarrier:
     their rest distance.
     """
 
+    # Arguments: all that the package's barrier depends on, which is compared with it.
     def __init__(
         self,
         surface: Surface,

@@ -172,6 +172,7 @@ class Trace:
     iterates: list[list[float]]
 
 
+# Arguments: what a reader of Fig. 2 may want to vary, each with its default.
 def vertex_and_plane(
     method: str,
     *,

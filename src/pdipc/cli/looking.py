@@ -45,6 +45,8 @@ class Obstacles(StrEnum):
 CAMERA, FILM, BODIES, STYLE = "Camera", "Film", "Bodies", "Style"  # panels of the help
 
 
+# Arguments: the options of the command.
+# Long: by their descriptions.
 @command()
 def render(
     folder: RunArgument,

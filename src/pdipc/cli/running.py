@@ -26,6 +26,7 @@ class Precision(StrEnum):
     float64 = "float64"
 
 
+# Arguments: the options of the command.
 @command()
 def run(
     scene: SceneArgument,

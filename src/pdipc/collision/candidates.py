@@ -44,7 +44,6 @@ ROD_SEPARATION = 0.7  # the same of rods, which are as thick as their radius als
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
     module = real.module(__name__)
-    dist = distance.functions(real)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
     nothing = wp.constant(scalar(IGNORED))
     silent = wp.constant(SILENT)
@@ -109,7 +108,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     elif flat[body[t[0]]] > 0:
                         faces_out[k] = face[pairs[k][1]]
                 else:
-                    rest_distance = dist.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]])
+                    rest_distance = scalar(distance.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]]))
                 limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
     @wp.kernel(module=module)
@@ -143,13 +142,13 @@ def kernels(real: Real) -> SimpleNamespace:
                     if flat[body[a[0]]] * inner[pairs[k][0]] + flat[body[b[0]]] * inner[pairs[k][1]] > 0:
                         faces_out[k] = silent
                 else:
-                    rest_distance = dist.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]])
+                    rest_distance = scalar(distance.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]]))
                 limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
     @wp.func
     def near(x: vec3, y: vec3, margin: scalar) -> bool:
         """A comparison with NaN is false: what is not known to be near is away."""
-        return wp.length(dist.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
+        return wp.length(distance.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
 
     @wp.kernel(module=module)
     def depart(

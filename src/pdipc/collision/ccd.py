@@ -44,8 +44,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.collision import cubic as cubics
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.collision.distance import relative
+from pdipc.device.precision import Real, Scalar, Vec3, unit_roundoff
 
 MAX_ITERATIONS = 64
 SLACK = 64.0 * 2.0**-53
@@ -58,196 +58,218 @@ SMALLEST, LARGEST = 1.0e-300, 1.0e300  # m, of a difference
 DIRECTIONS = 3  # choices of n that are tried before giving up
 
 
-@functools.cache
-def directions(real: Real) -> SimpleNamespace:
-    """Directions between closest points; `choice` 0 is the best guess, 1 and 2 are tried when that one does not separate."""
-    scalar, vec3 = real.scalar, real.vec3
-    zero = wp.constant(scalar(0.0))
+# Directions between closest points; `choice` 0 is the best guess, 1 and 2 are tried when that one does not separate.
 
-    @wp.func
-    def across(r: vec3, e: vec3) -> vec3:
-        """r made orthogonal to e once more: cancellation in r left a part along e, which is long where r is short."""
-        return r - (wp.dot(r, e) / wp.dot(e, e)) * e
 
-    @wp.func
-    def segment_direction(a: vec3, b: vec3) -> vec3:
-        """From the origin to the nearest point of a segment."""
-        e = b - a
-        along = -wp.dot(a, e)
-        length_sq = wp.dot(e, e)
-        if not along > zero:
-            return a
-        if not along < length_sq:
-            return b
-        return across(a + (along / length_sq) * e, e)
+@wp.func
+def across(r: Vec3, e: Vec3):
+    """r made orthogonal to e once more: cancellation in r left a part along e, which is long where r is short."""
+    return r - (wp.dot(r, e) / wp.dot(e, e)) * e
 
-    @wp.func
-    def shorter(a: vec3, b: vec3) -> vec3:
-        if wp.dot(b, b) < wp.dot(a, a):
-            return b
+
+@wp.func
+def segment_direction(a: Vec3, b: Vec3):
+    """From the origin to the nearest point of a segment."""
+    e = b - a
+    along = -wp.dot(a, e)
+    length_sq = wp.dot(e, e)
+    if not along > type(along)(0.0):
         return a
+    if not along < length_sq:
+        return b
+    return across(a + (along / length_sq) * e, e)
 
-    @wp.func
-    def facing(n: vec3, q: vec3) -> vec3:
-        if wp.dot(n, q) < zero:
-            return -n
-        return n
 
-    @wp.func
-    def vertex_triangle(a: vec3, b: vec3, c: vec3, choice: int) -> vec3:
-        """From a vertex at the origin to the nearest point of a triangle; not normalized."""
-        normal = wp.cross(b - a, c - a)
-        out_a = wp.dot(normal, wp.cross(b, c)) <= zero
-        out_b = wp.dot(normal, wp.cross(c, a)) <= zero
-        out_c = wp.dot(normal, wp.cross(a, b)) <= zero
-        inside = not (out_a or out_b or out_c)
-        if inside == (choice == 0):
-            return facing(normal, a)
-        if not inside:
-            # the nearest point is on an edge that the vertex is outside of; mostly there is just one
-            if not (out_b or out_c):
-                return segment_direction(b, c)
-            if not (out_a or out_c):
-                return segment_direction(c, a)
-            if not (out_a or out_b):
-                return segment_direction(a, b)
-        return shorter(shorter(segment_direction(a, b), segment_direction(b, c)), segment_direction(c, a))
+@wp.func
+def shorter(a: Vec3, b: Vec3):
+    if wp.dot(b, b) < wp.dot(a, a):
+        return b
+    return a
 
-    @wp.func
-    def edge_edge(q00: vec3, q01: vec3, q10: vec3, q11: vec3, choice: int) -> vec3:
-        """From the nearest point of edge a to that of edge b, q_ij = b_j - a_i; not normalized."""
-        e1 = q00 - q10
-        e2 = q01 - q00
-        a = wp.dot(e1, e1)
-        b = wp.dot(e1, e2)
-        e = wp.dot(e2, e2)
-        c = -wp.dot(e1, q00)
-        f = -wp.dot(e2, q00)
-        sine_sq = a * e - b * b
-        s = b * f - c * e
-        t = a * f - b * c
-        skew = sine_sq > scalar(ALIGNED) * a * e
-        inside = skew and s > zero and s < sine_sq and t > zero and t < sine_sq
-        if choice == 2 or (inside and choice == 1):
-            # from each end of one edge to the other edge
-            n = shorter(segment_direction(q00, q01), segment_direction(q10, q11))
-            return shorter(n, -shorter(segment_direction(-q00, -q10), segment_direction(-q01, -q11)))
-        if inside or choice == 1:
-            return facing(wp.cross(e1, e2), q00)
-        # an end of an edge is nearest: clamp s, then t, then s again
-        end1 = s >= sine_sq and skew
-        if skew and s > zero and not end1:
-            # t is past an end of b, and s is free
-            if t <= zero:
-                return -segment_direction(-q00, -q10)
-            return -segment_direction(-q01, -q11)
-        p0 = q00
-        t = f
-        if end1:
-            p0 = q10
-            t = f + b
+
+@wp.func
+def facing(n: Vec3, q: Vec3):
+    if wp.dot(n, q) < type(n[0])(0.0):
+        return -n
+    return n
+
+
+@wp.func
+def vertex_triangle_direction(a: Vec3, b: Vec3, c: Vec3, choice: int):
+    """From a vertex at the origin to the nearest point of a triangle; not normalized."""
+    zero = type(a[0])(0.0)
+    normal = wp.cross(b - a, c - a)
+    out_a = wp.dot(normal, wp.cross(b, c)) <= zero
+    out_b = wp.dot(normal, wp.cross(c, a)) <= zero
+    out_c = wp.dot(normal, wp.cross(a, b)) <= zero
+    inside = not (out_a or out_b or out_c)
+    if inside == (choice == 0):
+        return facing(normal, a)
+    if not inside:
+        # the nearest point is on an edge that the vertex is outside of; mostly there is just one
+        if not (out_b or out_c):
+            return segment_direction(b, c)
+        if not (out_a or out_c):
+            return segment_direction(c, a)
+        if not (out_a or out_b):
+            return segment_direction(a, b)
+    return shorter(shorter(segment_direction(a, b), segment_direction(b, c)), segment_direction(c, a))
+
+
+@wp.func
+def edge_edge_direction(q00: Vec3, q01: Vec3, q10: Vec3, q11: Vec3, choice: int):
+    """From the nearest point of edge a to that of edge b, q_ij = b_j - a_i; not normalized."""
+    zero = type(q00[0])(0.0)
+    e1 = q00 - q10
+    e2 = q01 - q00
+    a = wp.dot(e1, e1)
+    b = wp.dot(e1, e2)
+    e = wp.dot(e2, e2)
+    c = -wp.dot(e1, q00)
+    f = -wp.dot(e2, q00)
+    sine_sq = a * e - b * b
+    s = b * f - c * e
+    t = a * f - b * c
+    skew = sine_sq > type(zero)(ALIGNED) * a * e
+    inside = skew and s > zero and s < sine_sq and t > zero and t < sine_sq
+    if choice == 2 or (inside and choice == 1):
+        # from each end of one edge to the other edge
+        n = shorter(segment_direction(q00, q01), segment_direction(q10, q11))
+        return shorter(n, -shorter(segment_direction(-q00, -q10), segment_direction(-q01, -q11)))
+    if inside or choice == 1:
+        return facing(wp.cross(e1, e2), q00)
+    # an end of an edge is nearest: clamp s, then t, then s again
+    end1 = s >= sine_sq and skew
+    if skew and s > zero and not end1:
+        # t is past an end of b, and s is free
         if t <= zero:
             return -segment_direction(-q00, -q10)
-        if t >= e:
-            return -segment_direction(-q01, -q11)
-        return across(p0 + (t / e) * e2, e2)
+        return -segment_direction(-q01, -q11)
+    p0 = q00
+    t = f
+    if end1:
+        p0 = q10
+        t = f + b
+    if t <= zero:
+        return -segment_direction(-q00, -q10)
+    if t >= e:
+        return -segment_direction(-q01, -q11)
+    return across(p0 + (t / e) * e2, e2)
 
-    return SimpleNamespace(vertex_triangle=vertex_triangle, edge_edge=edge_edge)
+
+# Whether a pair keeps the gap all the time, decided by four directions, without a division or a root (Lemma 3).
 
 
-@functools.cache
-def reject(real: Real) -> SimpleNamespace:
-    """Whether a pair keeps the gap all the time, decided by four directions, without a division or a root (Lemma 3)."""
-    scalar, vec3 = real.scalar, real.vec3
-    direction = directions(real)
-    zero = wp.constant(scalar(0.0))
-    u = wp.constant(scalar(REJECT_SLACK * real.unit_roundoff))
-    # outside of these a square could under- or overflow
-    small_sq = wp.constant(scalar({"float32": 1.0e-30, "float64": 1.0e-250}[real.name]))
-    big = wp.constant(scalar({"float32": 1.0e6, "float64": 1.0e45}[real.name]))
+# Outside of these a square could under- or overflow.
+@wp.func
+def small_square(like: wp.float64):
+    return wp.float64(1.0e-250)
 
-    @wp.func
-    def axis(m0: scalar, m1: scalar, near: scalar, far: scalar, kept: scalar) -> bool:
-        m = wp.min(m0, m1)
-        return m > far or m - kept * m0 > near
 
-    @wp.func
-    def boxes(above0: vec3, above1: vec3, below0: vec3, below1: vec3, xi: scalar, backoff: scalar, reach: scalar) -> bool:
-        """Gaps of boxes along the axes in both orders, at the start and the end."""
-        near = (scalar(1.0) - backoff) * xi * (scalar(1.0) + u)
-        far = (xi + backoff * reach) * (scalar(1.0) + u)
-        kept = backoff + u
-        return (
-            axis(above0[0], above1[0], near, far, kept)
-            or axis(below0[0], below1[0], near, far, kept)
-            or axis(above0[1], above1[1], near, far, kept)
-            or axis(below0[1], below1[1], near, far, kept)
-            or axis(above0[2], above1[2], near, far, kept)
-            or axis(below0[2], below1[2], near, far, kept)
-        )
+@wp.func
+def small_square(like: wp.float32):  # noqa: F811
+    return wp.float32(1.0e-30)
 
-    @wp.func
-    def plane(n: vec3, m0: scalar, m1: scalar, size: scalar, xi: scalar, backoff: scalar, reach: scalar) -> bool:
-        """Projections on n, at least m0 at the start and m1 at the end, each off by the slack."""
-        slack = u * (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2])) * size
-        m0 -= slack
-        m = wp.min(m0, m1 - slack)
-        m -= slack
-        n_sq = wp.dot(n, n) * (scalar(1.0) + u)
-        near = (scalar(1.0) - backoff) * xi
-        far = xi + backoff * reach
-        over = m - backoff * m0
-        return (
-            n_sq > small_sq
-            and size < big
-            and ((over > zero and over * over > near * near * n_sq) or (m > zero and m * m > far * far * n_sq))
-        )
 
-    @wp.func
-    def vertex_triangle(
-        p0: vec3, a0: vec3, b0: vec3, c0: vec3, p1: vec3, a1: vec3, b1: vec3, c1: vec3,
-        xi: scalar, backoff: scalar, reach: scalar,
-    ) -> bool:  # fmt: skip
-        low0 = wp.min(wp.min(a0, b0), c0) - p0
-        low1 = wp.min(wp.min(a1, b1), c1) - p1
-        high0 = p0 - wp.max(wp.max(a0, b0), c0)
-        high1 = p1 - wp.max(wp.max(a1, b1), c1)
-        if boxes(low0, low1, high0, high1, xi, backoff, reach):
-            return True
-        qa = a0 - p0
-        qb = b0 - p0
-        qc = c0 - p0
-        n = direction.vertex_triangle(qa, qb, qc, 0)
-        m0 = wp.min(wp.min(wp.dot(n, qa), wp.dot(n, qb)), wp.dot(n, qc))
-        m1 = wp.min(wp.min(wp.dot(n, a1 - p1), wp.dot(n, b1 - p1)), wp.dot(n, c1 - p1))
-        # the boxes of the differences hold every component
-        size = -wp.min(wp.min(wp.min(low0), wp.min(low1)), wp.min(wp.min(high0), wp.min(high1)))
-        return plane(n, m0, m1, size, xi, backoff, reach)
+@wp.func
+def large_number(like: wp.float64):
+    return wp.float64(1.0e45)
 
-    @wp.func
-    def edge_edge(
-        a00: vec3, a10: vec3, b00: vec3, b10: vec3, a01: vec3, a11: vec3, b01: vec3, b11: vec3,
-        xi: scalar, backoff: scalar, reach: scalar,
-    ) -> bool:  # fmt: skip
-        low0 = wp.min(b00, b10) - wp.max(a00, a10)
-        low1 = wp.min(b01, b11) - wp.max(a01, a11)
-        high0 = wp.min(a00, a10) - wp.max(b00, b10)
-        high1 = wp.min(a01, a11) - wp.max(b01, b11)
-        if boxes(low0, low1, high0, high1, xi, backoff, reach):
-            return True
-        q00 = b00 - a00
-        q01 = b10 - a00
-        q10 = b00 - a10
-        q11 = b10 - a10
-        n = direction.edge_edge(q00, q01, q10, q11, 0)
-        m0 = wp.min(wp.dot(n, q00), wp.dot(n, q01)) - wp.max(wp.dot(n, a10 - a00), zero)
-        m1 = wp.min(wp.dot(n, b01 - a01), wp.dot(n, b11 - a01)) - wp.max(wp.dot(n, a11 - a01), zero)
-        wide0 = wp.max(b00, b10) - wp.min(a00, a10)
-        wide1 = wp.max(b01, b11) - wp.min(a01, a11)
-        size = wp.max(wp.max(wp.max(wide0), wp.max(wide1)), -wp.min(wp.min(low0), wp.min(low1)))
-        return plane(n, m0, m1, size, xi, backoff, reach)
 
-    return SimpleNamespace(vertex_triangle=vertex_triangle, edge_edge=edge_edge)
+@wp.func
+def large_number(like: wp.float32):  # noqa: F811
+    return wp.float32(1.0e6)
+
+
+@wp.func
+def keeps_on_axis(m0: Scalar, m1: Scalar, near: Scalar, far: Scalar, kept: Scalar) -> bool:
+    m = wp.min(m0, m1)
+    return m > far or m - kept * m0 > near
+
+
+@wp.func
+def boxes_keep(above0: Vec3, above1: Vec3, below0: Vec3, below1: Vec3, xi: Scalar, backoff: Scalar, reach: Scalar) -> bool:
+    """Gaps of boxes along the axes in both orders, at the start and the end."""
+    u = type(xi)(REJECT_SLACK) * unit_roundoff(xi)
+    near = (type(xi)(1.0) - backoff) * xi * (type(xi)(1.0) + u)
+    far = (xi + backoff * reach) * (type(xi)(1.0) + u)
+    kept = backoff + u
+    return (
+        keeps_on_axis(above0[0], above1[0], near, far, kept)
+        or keeps_on_axis(below0[0], below1[0], near, far, kept)
+        or keeps_on_axis(above0[1], above1[1], near, far, kept)
+        or keeps_on_axis(below0[1], below1[1], near, far, kept)
+        or keeps_on_axis(above0[2], above1[2], near, far, kept)
+        or keeps_on_axis(below0[2], below1[2], near, far, kept)
+    )
+
+
+@wp.func
+def plane_keeps(n: Vec3, m0: Scalar, m1: Scalar, size: Scalar, xi: Scalar, backoff: Scalar, reach: Scalar) -> bool:
+    """Projections on n, at least m0 at the start and m1 at the end, each off by the slack."""
+    zero = type(xi)(0.0)
+    u = type(xi)(REJECT_SLACK) * unit_roundoff(xi)
+    slack = u * (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2])) * size
+    m0 -= slack
+    m = wp.min(m0, m1 - slack)
+    m -= slack
+    n_sq = wp.dot(n, n) * (type(xi)(1.0) + u)
+    near = (type(xi)(1.0) - backoff) * xi
+    far = xi + backoff * reach
+    over = m - backoff * m0
+    return (
+        n_sq > small_square(xi)
+        and size < large_number(xi)
+        and ((over > zero and over * over > near * near * n_sq) or (m > zero and m * m > far * far * n_sq))
+    )
+
+
+# Arguments: a pair's eight points, and what it is to keep.
+@wp.func
+def vertex_triangle_keep(
+    p0: Vec3, a0: Vec3, b0: Vec3, c0: Vec3, p1: Vec3, a1: Vec3, b1: Vec3, c1: Vec3,
+    xi: Scalar, backoff: Scalar, reach: Scalar,
+) -> bool:  # fmt: skip
+    low0 = wp.min(wp.min(a0, b0), c0) - p0
+    low1 = wp.min(wp.min(a1, b1), c1) - p1
+    high0 = p0 - wp.max(wp.max(a0, b0), c0)
+    high1 = p1 - wp.max(wp.max(a1, b1), c1)
+    if boxes_keep(low0, low1, high0, high1, xi, backoff, reach):
+        return True
+    qa = a0 - p0
+    qb = b0 - p0
+    qc = c0 - p0
+    n = vertex_triangle_direction(qa, qb, qc, 0)
+    m0 = wp.min(wp.min(wp.dot(n, qa), wp.dot(n, qb)), wp.dot(n, qc))
+    m1 = wp.min(wp.min(wp.dot(n, a1 - p1), wp.dot(n, b1 - p1)), wp.dot(n, c1 - p1))
+    # the boxes of the differences hold every component
+    size = -wp.min(wp.min(wp.min(low0), wp.min(low1)), wp.min(wp.min(high0), wp.min(high1)))
+    return plane_keeps(n, m0, m1, size, xi, backoff, reach)
+
+
+# Arguments: a pair's eight points, and what it is to keep.
+@wp.func
+def edge_edge_keep(
+    a00: Vec3, a10: Vec3, b00: Vec3, b10: Vec3, a01: Vec3, a11: Vec3, b01: Vec3, b11: Vec3,
+    xi: Scalar, backoff: Scalar, reach: Scalar,
+) -> bool:  # fmt: skip
+    low0 = wp.min(b00, b10) - wp.max(a00, a10)
+    low1 = wp.min(b01, b11) - wp.max(a01, a11)
+    high0 = wp.min(a00, a10) - wp.max(b00, b10)
+    high1 = wp.min(a01, a11) - wp.max(b01, b11)
+    if boxes_keep(low0, low1, high0, high1, xi, backoff, reach):
+        return True
+    q00 = b00 - a00
+    q01 = b10 - a00
+    q10 = b00 - a10
+    q11 = b10 - a10
+    n = edge_edge_direction(q00, q01, q10, q11, 0)
+    m0 = wp.min(wp.dot(n, q00), wp.dot(n, q01)) - wp.max(wp.dot(n, a10 - a00), type(xi)(0.0))
+    m1 = wp.min(wp.dot(n, b01 - a01), wp.dot(n, b11 - a01)) - wp.max(wp.dot(n, a11 - a01), type(xi)(0.0))
+    wide0 = wp.max(b00, b10) - wp.min(a00, a10)
+    wide1 = wp.max(b01, b11) - wp.min(a01, a11)
+    size = wp.max(wp.max(wp.max(wide0), wp.max(wide1)), -wp.min(wp.min(low0), wp.min(low1)))
+    return plane_keeps(n, m0, m1, size, xi, backoff, reach)
 
 
 @functools.cache
@@ -259,20 +281,11 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     """
     scalar, vec3 = real.scalar, real.vec3
     wide, wide3 = wp.float64, wp.vec3d
-    double = real_of("float64")
-    direction = directions(double)
-    curve = cubics.functions(double)
-    first = reject(real)
     zero, one = wp.constant(wide(0.0)), wp.constant(wide(1.0))
     rounding_down = wp.constant(wide(1.0 - 4.0 * real.unit_roundoff))
     smallest = wp.constant(wide(1.0e-30))  # below, a float32 loses digits
     shortest_sq = wp.constant(wide(1.0e-280))  # below, a square does
     least_size, most_size = wp.constant(wide(SMALLEST)), wp.constant(wide(LARGEST))
-
-    @wp.func
-    def relative(x: vec3, origin: vec3) -> wide3:
-        """x - origin in double precision."""
-        return wide3(wide(x[0]) - wide(origin[0]), wide(x[1]) - wide(origin[1]), wide(x[2]) - wide(origin[2]))
 
     @wp.func
     def narrow(t: wide) -> scalar:
@@ -282,8 +295,10 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
         return scalar(t * rounding_down)
 
     def advance(edge_edge: bool):
+        # Arguments: the same, less the vertex that they are relative to.
+        # Long: one loop, whose parts share all of its state.
         @wp.func
-        def kernel(
+        def time_kept(
             p0: wide3, p1: wide3, p2: wide3, p3: wide3, r0: wide3, r1: wide3, r2: wide3, r3: wide3,
             xi: wide, backoff: wide, reach: wide,
         ) -> wide:  # fmt: skip
@@ -321,9 +336,9 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
                 q2 = p2 + t * (r2 - p2)
                 n = wide3()
                 if wp.static(edge_edge):
-                    n = direction.edge_edge(q0, q1, q2, p3 + t * (r3 - p3), choice)
+                    n = edge_edge_direction(q0, q1, q2, p3 + t * (r3 - p3), choice)
                 else:
-                    n = direction.vertex_triangle(q0, q1, q2, choice)
+                    n = vertex_triangle_direction(q0, q1, q2, choice)
                 length_sq = wp.dot(n, n)
                 if length_sq > shortest_sq:
                     n *= one / wp.sqrt(length_sq)
@@ -353,10 +368,10 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
                         v0 = p2 - p0
                         u1 = r1 - r0
                         v1 = r2 - r0
-                        k = curve.coefficients(u0, v0, p0, u1, v1, r0)
-                        margin = keep * curve.largest_area(u0, v0, u1, v1)
-                        margin += curve.coefficient_error(u0, v0, p0, u1, v1, r0, one)
-                        ahead = curve.first_root(k, margin * (one + slack), wide(TOLERANCE))
+                        k = cubics.coefficients(u0, v0, p0, u1, v1, r0)
+                        margin = keep * cubics.largest_area(u0, v0, u1, v1)
+                        margin += cubics.coefficient_error(u0, v0, p0, u1, v1, r0, one)
+                        ahead = cubics.first_root(k, margin * (one + slack), wide(TOLERANCE))
                         if ahead > one:
                             return wide(NEVER)
                         if wp.static(cubic == "filter"):
@@ -390,11 +405,12 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
                         return t
             return t
 
-        return kernel
+        return time_kept
 
     advance_vertex_triangle = advance(False)
     advance_edge_edge = advance(True)
 
+    # Arguments: a pair's eight points, and what it is to keep.
     @wp.func
     def vertex_triangle(
         p0: vec3, a0: vec3, b0: vec3, c0: vec3, p1: vec3, a1: vec3, b1: vec3, c1: vec3,
@@ -406,7 +422,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
         of the gap that is kept. reach: the gap in metres above which it counts no more; may be infinite.
         """
         if wp.static(rejects):  # noqa: SIM102
-            if first.vertex_triangle(p0, a0, b0, c0, p1, a1, b1, c1, xi, backoff, reach):
+            if vertex_triangle_keep(p0, a0, b0, c0, p1, a1, b1, c1, xi, backoff, reach):
                 return scalar(NEVER)
         q2 = relative(c0, p0)
         r2 = relative(c1, p1)
@@ -417,6 +433,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
             )
         )  # fmt: skip
 
+    # Arguments: the same.
     @wp.func
     def edge_edge(
         a00: vec3, a10: vec3, b00: vec3, b10: vec3, a01: vec3, a11: vec3, b01: vec3, b11: vec3,
@@ -424,7 +441,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     ) -> scalar:  # fmt: skip
         """The same for the edges a0-a1 and b0-b1; the second digit is 0 at the start and 1 at the end of the motion."""
         if wp.static(rejects):  # noqa: SIM102
-            if first.edge_edge(a00, a10, b00, b10, a01, a11, b01, b11, xi, backoff, reach):
+            if edge_edge_keep(a00, a10, b00, b10, a01, a11, b01, b11, xi, backoff, reach):
                 return scalar(NEVER)
         return narrow(
             advance_edge_edge(

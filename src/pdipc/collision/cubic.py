@@ -28,119 +28,105 @@ products and sums add 8u U V W <= 42u Q U V, and an area in the margin 20u Q (U 
 is taken off. Underflow is far below the rounding of the smallest d(0) that is used.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from pdipc.device.precision import Real
+wide = wp.float64
 
-EVALUATION = 32.0
-COEFFICIENTS = 128.0
+EVALUATION = 32.0 * 2.0**-53
+COEFFICIENTS = 128.0 * 2.0**-53
+SMALLEST = 1.0e-280  # below, products lose digits
 MAX_ITERATIONS = 16
 NEVER = 2.0
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """The cubic in one precision."""
-    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
-    u = real.unit_roundoff
-    zero, one = wp.constant(scalar(0.0)), wp.constant(scalar(1.0))
-    two, three = wp.constant(scalar(2.0)), wp.constant(scalar(3.0))
-    evaluation, coefficient = wp.constant(scalar(EVALUATION * u)), wp.constant(scalar(COEFFICIENTS * u))
-
-    smallest = wp.constant(scalar({"float32": 1.0e-30, "float64": 1.0e-280}[real.name]))  # below, products lose digits
-
-    @wp.func
-    def coefficients(u0: vec3, v0: vec3, w0: vec3, u1: vec3, v1: vec3, w1: vec3) -> vec4:
-        """(A, B, C, D) of the volume (u x v) . w as u, v, w move linearly from 0 to 1."""
-        du = u1 - u0
-        dv = v1 - v0
-        dw = w1 - w0
-        start = wp.cross(u0, v0)
-        middle = wp.cross(du, v0) + wp.cross(u0, dv)
-        end = wp.cross(du, dv)
-        return vec4(
-            wp.dot(end, dw),
-            wp.dot(end, w0) + wp.dot(middle, dw),
-            wp.dot(middle, w0) + wp.dot(start, dw),
-            wp.dot(start, w0),
-        )
-
-    @wp.func
-    def coefficient_error(u0: vec3, v0: vec3, w0: vec3, u1: vec3, v1: vec3, w1: vec3, size: scalar) -> scalar:
-        """How far d(t) with the computed coefficients may be from the true one on [0, 1]; size: the Q of the lemma."""
-        off = coefficient * size
-        big_u = wp.length(u0) + wp.length(u1 - u0) + off
-        big_v = wp.length(v0) + wp.length(v1 - v0) + off
-        big_w = wp.length(w0) + wp.length(w1 - w0) + off
-        return off * (big_u * big_v + (big_u + big_v) * big_w)
-
-    @wp.func
-    def largest_area(u0: vec3, v0: vec3, u1: vec3, v1: vec3) -> scalar:
-        """A bound of |u(t) x v(t)| on [0, 1]: the largest control point of this quadratic curve."""
-        middle = scalar(0.5) * (wp.cross(u0, v1) + wp.cross(u1, v0))
-        return wp.max(wp.max(wp.length(wp.cross(u0, v0)), wp.length(wp.cross(u1, v1))), wp.length(middle))
-
-    @wp.func
-    def value(k: vec4, t: scalar) -> scalar:
-        return ((k[0] * t + k[1]) * t + k[2]) * t + k[3]
-
-    @wp.func
-    def slope(k: vec4, t: scalar) -> scalar:
-        return (three * k[0] * t + two * k[1]) * t + k[2]
-
-    @wp.func
-    def first_root(k: vec4, margin: scalar, tolerance: scalar) -> scalar:
-        """Time up to which |A t^3 + B t^2 + C t + D| stays above `margin`, from below, or 2 where it does on all of [0, 1].
-
-        Ends where the value has come down to `tolerance` times the value at the start.
-        """
-        k = wp.where(k[3] < zero, -k, k)
-        rounding = evaluation * (wp.abs(k[0]) + wp.abs(k[1]) + wp.abs(k[2]) + wp.abs(k[3]))
-        k[3] = k[3] - margin - rounding
-        if not k[3] > smallest:
-            return zero
-        enough = tolerance * k[3]
-        # the extrema, where there are any inside
-        low = one
-        high = one
-        discriminant = k[1] * k[1] - three * k[0] * k[2]
-        if discriminant > zero:
-            root = wp.sqrt(discriminant)
-            q = -(k[1] + wp.where(k[1] < zero, -root, root))
-            r1 = wp.clamp(q / (three * k[0]), zero, one)
-            r2 = wp.clamp(k[2] / q, zero, one)
-            low = wp.min(r1, r2)
-            high = wp.max(r1, r2)
-        begin = zero
-        for piece in range(3):
-            end = one
-            if piece == 0:
-                end = low
-            if piece == 1:
-                end = high
-            if end > begin and not value(k, end) > zero:
-                steepest = wp.min(slope(k, begin), slope(k, end))
-                if k[0] > zero:
-                    inflection = -k[1] / (three * k[0])
-                    if inflection > begin and inflection < end:
-                        steepest = wp.min(steepest, k[2] + k[1] * inflection)
-                steepest = steepest - rounding
-                t = begin
-                for _iteration in range(wp.static(MAX_ITERATIONS)):
-                    d = value(k, t)
-                    if d <= enough:
-                        return t
-                    t = wp.min(t - d / steepest, end)
-                return t
-            begin = wp.max(begin, end)
-        return scalar(NEVER)
-
-    return SimpleNamespace(
-        coefficients=coefficients,
-        coefficient_error=coefficient_error,
-        largest_area=largest_area,
-        first_root=first_root,
+@wp.func
+def coefficients(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d, w1: wp.vec3d):
+    """(A, B, C, D) of the volume (u x v) . w as u, v, w move linearly from 0 to 1."""
+    du = u1 - u0
+    dv = v1 - v0
+    dw = w1 - w0
+    start = wp.cross(u0, v0)
+    middle = wp.cross(du, v0) + wp.cross(u0, dv)
+    end = wp.cross(du, dv)
+    return wp.vec4d(
+        wp.dot(end, dw),
+        wp.dot(end, w0) + wp.dot(middle, dw),
+        wp.dot(middle, w0) + wp.dot(start, dw),
+        wp.dot(start, w0),
     )
+
+
+@wp.func
+def coefficient_error(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d, w1: wp.vec3d, size: wide):
+    """How far d(t) with the computed coefficients may be from the true one on [0, 1]; size: the Q of the lemma."""
+    off = wide(COEFFICIENTS) * size
+    big_u = wp.length(u0) + wp.length(u1 - u0) + off
+    big_v = wp.length(v0) + wp.length(v1 - v0) + off
+    big_w = wp.length(w0) + wp.length(w1 - w0) + off
+    return off * (big_u * big_v + (big_u + big_v) * big_w)
+
+
+@wp.func
+def largest_area(u0: wp.vec3d, v0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d):
+    """A bound of |u(t) x v(t)| on [0, 1]: the largest control point of this quadratic curve."""
+    middle = wide(0.5) * (wp.cross(u0, v1) + wp.cross(u1, v0))
+    return wp.max(wp.max(wp.length(wp.cross(u0, v0)), wp.length(wp.cross(u1, v1))), wp.length(middle))
+
+
+@wp.func
+def value(k: wp.vec4d, t: wide):
+    return ((k[0] * t + k[1]) * t + k[2]) * t + k[3]
+
+
+@wp.func
+def slope(k: wp.vec4d, t: wide):
+    return (wide(3.0) * k[0] * t + wide(2.0) * k[1]) * t + k[2]
+
+
+@wp.func
+def first_root(k: wp.vec4d, margin: wide, tolerance: wide):
+    """Time up to which |A t^3 + B t^2 + C t + D| stays above `margin`, from below, or 2 where it does on all of [0, 1].
+
+    Ends where the value has come down to `tolerance` times the value at the start.
+    """
+    zero, one, three = wide(0.0), wide(1.0), wide(3.0)
+    k = wp.where(k[3] < zero, -k, k)
+    rounding = wide(EVALUATION) * (wp.abs(k[0]) + wp.abs(k[1]) + wp.abs(k[2]) + wp.abs(k[3]))
+    k[3] = k[3] - margin - rounding
+    if not k[3] > wide(SMALLEST):
+        return zero
+    enough = tolerance * k[3]
+    # the extrema, where there are any inside
+    low = one
+    high = one
+    discriminant = k[1] * k[1] - three * k[0] * k[2]
+    if discriminant > zero:
+        root = wp.sqrt(discriminant)
+        q = -(k[1] + wp.where(k[1] < zero, -root, root))
+        r1 = wp.clamp(q / (three * k[0]), zero, one)
+        r2 = wp.clamp(k[2] / q, zero, one)
+        low = wp.min(r1, r2)
+        high = wp.max(r1, r2)
+    begin = zero
+    for piece in range(3):
+        end = one
+        if piece == 0:
+            end = low
+        if piece == 1:
+            end = high
+        if end > begin and not value(k, end) > zero:
+            steepest = wp.min(slope(k, begin), slope(k, end))
+            if k[0] > zero:
+                inflection = -k[1] / (three * k[0])
+                if inflection > begin and inflection < end:
+                    steepest = wp.min(steepest, k[2] + k[1] * inflection)
+            steepest = steepest - rounding
+            t = begin
+            for _iteration in range(wp.static(MAX_ITERATIONS)):
+                d = value(k, t)
+                if d <= enough:
+                    return t
+                t = wp.min(t - d / steepest, end)
+            return t
+        begin = wp.max(begin, end)
+    return wide(NEVER)

@@ -210,6 +210,7 @@ def kernels(real: Real) -> SimpleNamespace:
         elif patches.neighbours_end[p] <= patches.capacity:
             traverse(patches, p, begin, True)
 
+    # Arguments: two sides with their boxes, and where what is found goes.
     @wp.func
     def search_triangles(
         r: int,

@@ -29,24 +29,47 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from pdipc.collision import ccd, distance
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.collision import ccd
+from pdipc.collision.distance import relative
+from pdipc.device.precision import Real, Scalar
 
 SLACK = 16.0 * 2.0**-53
+ENOUGH = 1.0 + SLACK
 LARGEST = 1.0e45  # m: the S of the lemma
 SMALLEST, LEAST = 1.0e-100, 1.0e-90  # of |n|^2, and of R in m
+
+
+wide, wide3 = wp.float64, wp.vec3d
+
+
+@wp.func
+def separates(n: wide3, gap: wide, size: wide, a: Scalar, b: Scalar) -> bool:
+    """Whether a gap along n, times |n|, is proven to be more than the two reaches a and b; size: the S of the lemma."""
+    left = gap - wide(SLACK) * (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2])) * size
+    far = wp.max(wide(a) + wide(b), wide(LEAST))
+    n_sq = wp.dot(n, n)
+    return n_sq > wide(SMALLEST) and left > wide(0.0) and left * left > far * far * n_sq * wide(ENOUGH)
+
+
+@wp.func
+def extent(a: wide3, b: wide3, c: wide3) -> wide:
+    return wp.max(wp.max(wp.max(wp.abs(a), wp.abs(b)), wp.abs(c)))
+
+
+@wp.func
+def least(n: wide3, a: wide3, b: wide3, c: wide3) -> wide:
+    return wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, c))
+
+
+@wp.func
+def between(n: wide3, a1: wide3, b0: wide3, b1: wide3) -> wide:
+    """The gap along n between the edges 0-a1 and b0-b1, times |n|."""
+    return wp.min(wp.dot(n, b0), wp.dot(n, b1)) - wp.max(wp.dot(n, a1), wide(0.0))
 
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
-    wide, wide3 = wp.float64, wp.vec3d
-    relative = distance.functions(real).relative
-    direction = ccd.directions(real_of("float64"))
-    slack, enough = wp.constant(wide(SLACK)), wp.constant(wide(1.0 + SLACK))
-    largest, smallest, nearest = (wp.constant(wide(value)) for value in (LARGEST, SMALLEST, LEAST))
-    zero = wp.constant(wide(0.0))
 
     @wp.struct
     class Sieve:
@@ -54,22 +77,6 @@ def functions(real: Real) -> SimpleNamespace:
         begin: wp.array(dtype=vec3)  # of each vertex, m
         end: wp.array(dtype=vec3)
         reach: wp.array(dtype=scalar)  # of each vertex, m; one for all of a body
-
-    @wp.func
-    def separates(n: wide3, gap: wide, size: wide, a: scalar, b: scalar) -> bool:
-        """Whether a gap along n, times |n|, is proven to be more than the two reaches a and b; size: the S of the lemma."""
-        left = gap - slack * (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2])) * size
-        far = wp.max(wide(a) + wide(b), nearest)
-        n_sq = wp.dot(n, n)
-        return n_sq > smallest and left > zero and left * left > far * far * n_sq * enough
-
-    @wp.func
-    def extent(a: wide3, b: wide3, c: wide3) -> wide:
-        return wp.max(wp.max(wp.max(wp.abs(a), wp.abs(b)), wp.abs(c)))
-
-    @wp.func
-    def least(n: wide3, a: wide3, b: wide3, c: wide3) -> wide:
-        return wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, c))
 
     @wp.func
     def vertex_triangle(sieve: Sieve, v: int, t: wp.vec3i) -> bool:
@@ -85,19 +92,14 @@ def functions(real: Real) -> SimpleNamespace:
         )
         e0, e1, e2 = relative(sieve.end[t[0]], end), relative(sieve.end[t[1]], end), relative(sieve.end[t[2]], end)
         size = wp.max(extent(b0, b1, b2), extent(e0, e1, e2))
-        if not (size < largest):
+        if not (size < wide(LARGEST)):
             return True
         m0, m1, m2 = b0 + e0, b1 + e1, b2 + e2  # twice where they are at half of the way
         n = m0 + m1 + m2
         if separates(n, wp.min(least(n, b0, b1, b2), least(n, e0, e1, e2)), size, sieve.reach[v], sieve.reach[t[0]]):
             return False
-        n = direction.vertex_triangle(m0, m1, m2, 0)
+        n = ccd.vertex_triangle_direction(m0, m1, m2, 0)
         return not separates(n, wp.min(least(n, b0, b1, b2), least(n, e0, e1, e2)), size, sieve.reach[v], sieve.reach[t[0]])
-
-    @wp.func
-    def between(n: wide3, a1: wide3, b0: wide3, b1: wide3) -> wide:
-        """The gap along n between the edges 0-a1 and b0-b1, times |n|."""
-        return wp.min(wp.dot(n, b0), wp.dot(n, b1)) - wp.max(wp.dot(n, a1), zero)
 
     @wp.func
     def edge_edge(sieve: Sieve, a: wp.vec2i, b: wp.vec2i) -> bool:
@@ -113,13 +115,13 @@ def functions(real: Real) -> SimpleNamespace:
         )
         e1, q0, q1 = relative(sieve.end[a[1]], end), relative(sieve.end[b[0]], end), relative(sieve.end[b[1]], end)
         size = wp.max(extent(b1, p0, p1), extent(e1, q0, q1))
-        if not (size < largest):
+        if not (size < wide(LARGEST)):
             return True
         m1, n0, n1 = b1 + e1, p0 + q0, p1 + q1  # twice where they are at half of the way
         n = n0 + n1 - m1
         if separates(n, wp.min(between(n, b1, p0, p1), between(n, e1, q0, q1)), size, sieve.reach[a[0]], sieve.reach[b[0]]):
             return False
-        n = direction.edge_edge(n0, n1, n0 - m1, n1 - m1, 0)
+        n = ccd.edge_edge_direction(n0, n1, n0 - m1, n1 - m1, 0)
         return not separates(
             n, wp.min(between(n, b1, p0, p1), between(n, e1, q0, q1)), size, sieve.reach[a[0]], sieve.reach[b[0]]
         )

@@ -45,7 +45,7 @@ MAX_PASSES = 60  # and after which all do
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, vec4 = real.scalar, real.vec2, real.vec3, real.vec4
     module = real.module(__name__)
-    c, dist = ccd.functions(real), distance.functions(real)
+    c = ccd.functions(real)
     unit = wp.constant(UNIT)
 
     def sweep(kind: str):
@@ -94,9 +94,9 @@ def kernels(real: Real) -> SimpleNamespace:
                             hits += 1
                             apart = scalar(0.0)
                             if wp.static(edge_edge):
-                                apart = dist.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                apart = scalar(distance.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                             else:
-                                apart = dist.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                apart = scalar(distance.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                             if apart - xi < scalar(DEEP) * limits[k][1]:
                                 # whoever writes, writes the same
                                 if island_of[q[0]] >= 0:
@@ -156,9 +156,9 @@ def kernels(real: Real) -> SimpleNamespace:
                             if passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
                                 a = vec4()
                                 if wp.static(edge_edge):
-                                    a = dist.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                    a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                                 else:
-                                    a = dist.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                    a = vec4(distance.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                                 apart = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
                                 away = scalar(0.0)
                                 for s in range(4):

@@ -138,6 +138,7 @@ def hessians(real: Real) -> SimpleNamespace:
             u1 = wp.cross(u2, n)
         return angle, s1, s2, u1, u2, n
 
+    # Arguments: an element in its own axes, and where its blocks go.
     @wp.func
     def write(
         stretch: vec3,

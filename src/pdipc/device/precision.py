@@ -1,8 +1,11 @@
-"""The floating-point type that a scene computes in, and how kernels are made for it.
+"""The floating-point type that a scene computes in, and how functions and kernels are made for it.
 
-Every kernel file holds factories, `functions(real)` and `kernels(real)`, that build its Warp functions and kernels once for
-each precision. So there is one source for float32 and float64, the constants in it have the right type, and a formula can be
-called from Python: `functions(real("float64")).barrier(d, d_hat)`.
+Mathematics stands in functions of modules, which hold for both types: their arguments are `Scalar` or `Vec3`, and Warp makes an overload
+for the types that a kernel calls one with. A constant has the type of an argument, `type(x)(0.5)`. From Python they are called as they
+are: `potential.barrier(d, d_hat)`.
+
+Kernels are made by factories, `kernels(real)`, once for each precision, since an array's type is part of a kernel. Where a function
+needs a type of its own, such as a struct with arrays, a factory `functions(real)` makes it.
 """
 
 import functools
@@ -14,6 +17,21 @@ import numpy as np
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING  # no banner; every module that uses Warp imports this one
+
+# What a function of both precisions takes.
+Scalar = wp.Float
+Vec3, Vec4, Mat33 = wp.types.vector(3, wp.Float), wp.types.vector(4, wp.Float), wp.types.matrix((3, 3), wp.Float)
+
+
+@wp.func
+def unit_roundoff(like: wp.float64):
+    """Half the spacing of numbers just above one, in the type of `like`."""
+    return wp.float64(wp.static(2.0**-53))
+
+
+@wp.func
+def unit_roundoff(like: wp.float32):  # noqa: F811
+    return wp.float32(wp.static(2.0**-24))
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         if worker % wp.block_dim() == 0:
             delta_out[block] = delta
 
+    # Long: all vectors in one launch an iteration, which is what this solver is for.
     @wp.kernel(module=module)
     def advance(
         first: int,

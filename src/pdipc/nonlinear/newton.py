@@ -646,6 +646,7 @@ class Newton:
     numbers: on the device, see `status`: the largest motion that the last iteration wanted, m; forces, N; lag, m.
     """
 
+    # Long: all that lives as long as the solve is made here.
     def __init__(self, work):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count

@@ -34,7 +34,6 @@ OUTER_SQUARED = 1.0e-4  # eps_outer, m^2: the outer loop ends when the squared n
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
     module = real.module(__name__)
-    bar = barrier.functions(real)
 
     @wp.kernel(module=module)
     def remember(
@@ -84,7 +83,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 if approach < scalar(0.0) and response > scalar(0.0):
                     impulse = -(scalar(1.0) + restitution) * approach / response
                 impulse_out[k] = impulse
-                steep = bar.barrier(gaps[k], activation[k]) / (activation[k] * activation[k])
+                steep = barrier.barrier(gaps[k], activation[k]) / (activation[k] * activation[k])
                 pull_out[k] = scalar(0.0)
                 if response > scalar(0.0):
                     pull_out[k] = stiffness[k] * steep + lightest / (h * h)

@@ -48,6 +48,7 @@ class Stage:
     Raises OSError for a host that this machine cannot serve at, ValueError for an origin that is none.
     """
 
+    # Arguments: what is shown, and where it is served.
     def __init__(
         self,
         triangles: np.ndarray,
