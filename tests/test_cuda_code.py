@@ -12,72 +12,25 @@ import pytest
 import warp as wp
 from device.emulated import Emulated
 from device.machine_code import EVERYTHING, compile_all
+from factories import STEP
 
-from pdipc.barrier import exact, friction, pairs, restitution
-from pdipc.collision import bvh, candidates, islands, patches, queries, truncation
-from pdipc.collision import moving_boxes as sweep
-from pdipc.constraints import projector
 from pdipc.device import launch as parallel
-from pdipc.device import sums
 from pdipc.device.precision import real
-from pdipc.integration import inertia, script
-from pdipc.integration import loads as forces
-from pdipc.linear import affine, block_pcg, blocks, rigid_modes, wide_modes, wide_pcg
-from pdipc.nonlinear import anderson, local_global, newton
-from pdipc.paper_mode import energy_rate, printed
-from pdipc.paper_mode import targets as paper
 
 ARCHITECTURES = (75, 86, 90, 100)
-FACTORIES = {
-    "step": inertia.kernels,
-    "script": script.kernels,
-    "newton": newton.kernels,
-    "body sums": lambda _: sums.kernels(),
-    "local-global": local_global.kernels,
-    "printed": printed.kernels,
-    "exact barrier": exact.kernels,
-    "barrier coupling": lambda precision: {"couple": exact.coupling(precision)},
-    "friction": friction.kernels,
-    "friction coupling": lambda precision: {"couple": friction.coupling(precision)},
-    "islands": islands.kernels,
-    "blocks": blocks.kernels,
-    "rigid modes": rigid_modes.kernels,
-    "block pcg": block_pcg.kernels,
-    "wide modes": wide_modes.kernels,
-    "wide couplings": lambda precision: {"a": exact.wide_coupling(precision), "b": friction.wide_coupling(precision)},
-    "wide pcg": lambda precision: wide_pcg.kernels(precision, exact.operator(precision), friction.operator(precision)),
-    "affine": affine.kernels,
-    "flags": lambda precision: {"positive": newton._positive(precision)},
-    "forces": forces.kernels,
-    "reductions": lambda precision: parallel.kernels(precision),
-    "scan": lambda _: parallel.scan_kernels(),
-    "anderson": anderson.kernels,
-    "energy_rate": energy_rate.kernels,
-    "gather": projector.kernels_of,
-    **{kind.__name__.rsplit(".", 1)[1]: kind.kernels for kind in projector.KINDS},
-    "candidates": candidates.kernels,
-    "sweep": sweep.kernels,
-    "bvh": bvh.kernels,
-    "patches": patches.kernels,
-    "pairs": pairs.kernels,
-    "paper": paper.kernels,
-    "restitution": restitution.kernels,
-    "truncation": truncation.kernels,
-    "time of impact": queries.kernels,
-}
 
 
 OWN_CODE = {"newton", "rigid modes", "wide modes", "wide couplings", "wide pcg", "reductions", "time of impact"}
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("name", FACTORIES)
+@pytest.mark.parametrize("name", STEP)
 def test_compiles(name, precision, tmp_path):
     """To machine code."""
     if precision == "float64" and name not in OWN_CODE and not EVERYTHING:
         pytest.skip("the same source is compiled in float32; set PDIPC_ALL_ARCHITECTURES for both")
     turn = zlib.crc32(f"{name} {precision}".encode()) % len(ARCHITECTURES)
-    compile_all(FACTORIES[name](real(precision)), ARCHITECTURES if EVERYTHING else ARCHITECTURES[turn : turn + 1], tmp_path)
+    compile_all(STEP[name](real(precision)), ARCHITECTURES if EVERYTHING else ARCHITECTURES[turn : turn + 1], tmp_path)
 
 
 @pytest.mark.parametrize("count", [1, 3, 255, 256, 257, 70_000])

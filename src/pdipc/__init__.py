@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from pdipc.simulation import run_scene as run_scene
     from pdipc.simulation import simulate as simulate
     from pdipc.sweeps.run import run_sweep as run_sweep
-    from pdipc.worlds import Worlds as Worlds
-    from pdipc.worlds import run_worlds as run_worlds
+    from pdipc.sweeps.worlds import Worlds as Worlds
+    from pdipc.sweeps.worlds import run_worlds as run_worlds
 
 __version__ = "0.1.0"
 
@@ -150,7 +150,7 @@ _PUBLIC = {
     "Stitch": "pdipc.scene.schema",
     "VertexForce": "pdipc.scene.schema",
     "Wind": "pdipc.scene.schema",
-    "Worlds": "pdipc.worlds",
+    "Worlds": "pdipc.sweeps.worlds",
     "build": "pdipc.model",
     "check_scene": "pdipc.scene.check:check",
     "find_intersections": "pdipc.judge.witness",
@@ -158,7 +158,7 @@ _PUBLIC = {
     "open_run": "pdipc.output.results",
     "run_scene": "pdipc.simulation",
     "run_sweep": "pdipc.sweeps.run",
-    "run_worlds": "pdipc.worlds",
+    "run_worlds": "pdipc.sweeps.worlds",
     "simulate": "pdipc.simulation",
     "step": "pdipc.drive",
     "time_of_impact": "pdipc.collision.queries",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from factories import modules
 
 EVERYTHING = bool(os.environ.get("PDIPC_ALL_ARCHITECTURES"))  # all modules in both precisions, optimized as they run
 
@@ -15,10 +16,9 @@ def compile_all(made: object, architectures: Iterable[int], folder: Path) -> Non
 
     Without EVERYTHING nothing is optimized: that takes more than half of the time and finds no errors.
     """
-    found = (made if isinstance(made, dict) else vars(made)).values()
-    modules = {kernel.module for kernel in found if isinstance(kernel, wp.Kernel)}
-    assert modules
-    for module in modules:
+    found = modules(made)
+    assert found
+    for module in found:
         with pytest.MonkeyPatch.context() as patched:
             if not EVERYTHING:
                 patched.setitem(module.options, "optimization_level", 0)

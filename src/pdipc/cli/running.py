@@ -74,7 +74,7 @@ def run(
     try:
         with stop.after_steps(), bar_of_steps(total, Console(stderr=True)) as bar:
             from pdipc.simulation import run_scene
-            from pdipc.worlds import run_worlds
+            from pdipc.sweeps.worlds import run_worlds
 
             def advance(info: "StepInfo") -> None:
                 nonlocal total

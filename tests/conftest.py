@@ -1,0 +1,25 @@
+"""Before a whole run on several workers, each compiles its part of the kernels, which otherwise all of them would compile at once."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+WHOLE = 1000  # tests, about half of all
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Loads what this worker is to compile; what is in Warp's cache already takes no time."""
+    name, count = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if count == 1 or len(session.items) < WHOLE:
+        return
+    import factories
+
+    from pdipc.device.precision import real
+
+    made = [factory(real("float64")) for factory in factories.ON_CPU.values()]  # of float32 not all is used
+    modules = list(dict.fromkeys(module for each in made for module in sorted(factories.modules(each), key=lambda m: m.name)))
+    for module in modules[int(name.removeprefix("gw")) :: count]:
+        module.load("cpu", block_dim=1)
