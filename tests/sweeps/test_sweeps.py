@@ -109,7 +109,7 @@ class Cluster:
         for process in reversed(self.processes):
             process.terminate()
         for process in self.processes:
-            process.wait(timeout=30)
+            process.wait(timeout=120)
 
 
 def kill_a_worker(folder, killed: list):
@@ -132,9 +132,9 @@ def test_a_killed_worker_is_replaced_and_its_run_goes_on(scene, tmp_path):
         killer = threading.Thread(target=kill_a_worker, args=(tmp_path / "swept", killed), daemon=True)
         killer.start()
         failures = sweeps.run_sweep(scene, SETTINGS, tmp_path / "swept", scheduler=cluster.address)
-        killer.join(timeout=30)
+        killer.join(timeout=120)
         with distributed.Client(cluster.address) as client:
-            client.wait_for_workers(2, timeout=30)  # the dead one has a successor
+            client.wait_for_workers(2, timeout=120)  # the dead one has a successor
             processes = set(client.run(os.getpid).values())
     assert failures == {} and len(killed) == 1
     process, run = killed[0]

@@ -52,7 +52,12 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
     with (
         # without a limit of memory: Dask would end a worker for using more than an even share
         LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, env={"PDIPC_THREADS": share}
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # what it serves all the same, at a port that is free
+            env={"PDIPC_THREADS": share},
         ) as cluster,
         Client(cluster) as client,
     ):
