@@ -10,9 +10,9 @@ from pdipc.barrier.restitution import Restitution
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.integration import status
-from pdipc.integration.script import AHEAD, ARRIVED, WILL
 from pdipc.linear import Translations
 from pdipc.nonlinear.anderson import Anderson
+from pdipc.nonlinear.newton import Newton
 
 INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the tolerance
 REBOUND_ITERATIONS, REBOUND_TOLERANCE = 200, 1e-5  # of the iterations for restitution: most, and relative motion
@@ -65,59 +65,9 @@ def kernels(real: Real) -> SimpleNamespace:
         moved_out[i] = moved
 
     @wp.kernel(module=module)
-    def decide(
-        first: int,
-        pairs: wp.array(dtype=wp.int32),
-        passes: wp.array(dtype=wp.int32),
-        overflow: wp.array(dtype=wp.int32),
-        script: wp.array(dtype=wp.int32),
-        increment: wp.array(dtype=scalar),
-        clock: wp.array(dtype=wp.float64),
-        tolerance: scalar,
-        max_outer: int,
-        budget_ms: wp.float64,
-        numbers: wp.array(dtype=scalar),
-        count: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
-    ):
-        """Line 16, at the untruncated motion: the truncated one becomes small because t_I does, converged or not. script: its flags.
-
-        Iterations converge linearly: with the ratio r of the last two motions the error that is left is about r / (1 - r) of the last.
-        """
-        code = int(status.RUNNING)
-        residual = numbers[status.MOVED]
-        # the first motion says nothing of how fast they shrink
-        ratio = scalar(0.99)
-        if count[status.OUTER] > 0:
-            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
-        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
-        numbers[status.MOVED_BEFORE] = residual
-        if overflow[0] != 0:
-            code = status.OVERFLOW
-        elif residual >= scalar(wp.inf):
-            code = status.NOT_FINITE
-            count[status.OUTER] = count[status.OUTER] + 1
-        else:
-            count[status.OUTER] = count[status.OUTER] + 1
-            count[status.SINCE] = count[status.SINCE] + 1
-            count[status.BARRIERS] = pairs[0]
-            if script[ARRIVED] != 0:
-                count[status.SINCE] = 0
-            if passes[0] > 0:
-                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
-            settled = passes[0] == 0 and left <= tolerance
-            if settled and script[AHEAD] == 0:
-                code = status.CONVERGED
-            elif settled and script[WILL] == 0:
-                code = status.LAGGING
-            elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
-                code = status.OUT_OF_TIME
-            elif count[status.SINCE] >= max_outer:
-                code = status.CAPPED
-        count[status.STATUS] = code
-        going_out[0] = 0
-        if code == status.RUNNING:
-            going_out[0] = 1
+    def direct(first: int, u: wp.array(dtype=vec3), u_tilde: wp.array(dtype=vec3), p_out: wp.array(dtype=vec3)):
+        i = first + wp.tid()
+        p_out[i] = u_tilde[i] - u[i]
 
     @wp.kernel(module=module)
     def commit(
@@ -157,11 +107,11 @@ def kernels(real: Real) -> SimpleNamespace:
             if drive[wp.max(mover[i], 0)] != 0:
                 u_tilde_out[i] = target[i] - base[i]
 
-    return SimpleNamespace(inertia=inertia, measure=measure, decide=decide, commit=commit, lead=lead)
+    return SimpleNamespace(inertia=inertia, measure=measure, direct=direct, commit=commit, lead=lead)
 
 
-class LocalGlobal:
-    """See `nonlinear.Method`."""
+class Iterations:
+    """What local-global methods share; see `nonlinear.Method`."""
 
     def __init__(self, work):
         model = work.model
@@ -253,25 +203,53 @@ class LocalGlobal:
 
         self.device.loop(parting.going, local_global)
 
+    def _lead(self) -> None:
+        w, n = self.work, self.model.vertex_count
+        aims = [w.script.target, w.script.goal, w.script.mover, w.script.drive]
+        self.device.launch(self.kernels.lead, n, [w.x_start, w.u, self.model.free, *aims, w.u_tilde, self.lags])
+
+
+class LocalGlobal(Iterations):
+    """The default mode's: as much of their motion is made as lowers the true potential, island by island, as with Newton's method.
+
+    Not with friction, which here follows the iterate and so has no potential: then all of the truncated motion is made.
+    """
+
+    def _make(self) -> None:
+        super()._make()
+        self.descent = Newton(self.work)
+        self.descent.descends = not self.model.has_friction
+        self.numbers = self.descent.numbers
+
+    @property
+    def generation(self) -> int:
+        """Grows whenever arrays were replaced."""
+        return self.pairs.generation + self.descent.generation
+
+    def grow(self) -> bool:
+        """Makes room where a list was full."""
+        return any([self.pairs.grow(), self.descent.grow()])
+
+    def start(self) -> None:
+        """The predictor, and the potential where the step starts."""
+        super().start()
+        self.descent.start()
+
+    def freeze(self) -> None:
+        """Line 5."""
+        super().freeze()
+        self.descent.freeze()
+        self.device.launch(self.descent.kernels.clear, 1, [self.descent.project])
+
+    def solve(self) -> None:
+        """Lines 6 to 12."""
+        super().solve()
+        w = self.work
+        self.device.launch(self.kernels.direct, self.model.vertex_count, [w.u, w.u_tilde, self.descent.p])
+
     def accept(self) -> None:
         """Line 16."""
-        w, k = self.work, self.kernels
+        w = self.work
         self.pairs.expect(w.u, w.u_tilde, w.truncation.fraction)
-        t, n, free = w.truncation, self.model.vertex_count, self.model.free
-        motion = [t.u_end, t.x_end, w.u, w.x]
-        self._measure()
-        self.device.launch(k.commit, n, [w.candidates.overflow, self.numbers, *motion])
-        w.script.advance(w.x_start, w.u, t.fraction)
-        aims = [w.script.target, w.script.goal, w.script.mover, w.script.drive]
-        self.device.launch(k.lead, n, [w.x_start, w.u, free, *aims, w.u_tilde, self.lags])
-        self.largest.max(self.lags, self.numbers, status.LAG)
-        self._decide(k.decide, [])
-
-    def _measure(self) -> None:
-        """What is to be known of the motion before it is made: nothing."""
-
-    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
-        w, s = self.work, self.model.settings
-        states = [self.pairs.count, w.truncation.passes, w.candidates.overflow, w.script.flags, self.loop.moved, w.clock]
-        limits = [self.model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
-        self.device.launch_serial(kernel, [*states, *limits, *extra, self.numbers, w.count, w.going])
+        self.descent.accept()
+        self._lead()

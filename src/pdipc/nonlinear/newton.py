@@ -457,6 +457,10 @@ def kernels(real: Real) -> SimpleNamespace:
         flags_out[first + wp.tid()] = 0
 
     @wp.kernel(module=module)
+    def exempt(first: int, flags_out: wp.array(dtype=wp.int32)):
+        flags_out[first + wp.tid()] = 1
+
+    @wp.kernel(module=module)
     def set_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
         flag_out[0] = 1
 
@@ -690,6 +694,7 @@ class Newton:
         of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
         elements = np.concatenate([*of_elements, np.zeros(0, dtype=owner.dtype)])
         self.bodies = len(simulated)
+        self.descends = True  # whether a motion has to lower the potential
         self.base_sums = BodySums(device, [elements, owner], self.bodies)
         self.friction_sums = BodySums(device, [owner], self.bodies)
 
@@ -901,6 +906,8 @@ class Newton:
         if w.script.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
             self.islands.find_driven(w.candidates, w.u, w.u_tilde)
+        if not self.descends and self.bodies:
+            device.launch(k.exempt, self.bodies, [self.islands.driven])
         self._evaluate(t.u_end, t.x_end)
         energies = [
             self.base_old,

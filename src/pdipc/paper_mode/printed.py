@@ -9,7 +9,7 @@ from pdipc.barrier.pairs import Exerted
 from pdipc.device.precision import Real
 from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
-from pdipc.nonlinear.local_global import LocalGlobal
+from pdipc.nonlinear.local_global import Iterations
 from pdipc.paper_mode.energy_rate import EnergyRate
 from pdipc.paper_mode.reactions import reactions
 from pdipc.paper_mode.targets import OUTER_SQUARED, PaperPairs
@@ -78,7 +78,7 @@ def kernels(real: Real):
     return SimpleNamespace(measure_squared=measure_squared, decide=decide)
 
 
-class Printed(LocalGlobal):
+class Printed(Iterations):
     """See `nonlinear.Method`. The paper starts its solves from rest, and its diagonal changes with the barriers only (Section 5)."""
 
     def _make(self) -> None:
@@ -115,10 +115,18 @@ class Printed(LocalGlobal):
         forces = reactions(missing, quads, parts, model.assembly.body_of_vertex, model.free_vertices)
         return Exerted(quads, forces), Exerted(quads[:0], forces[:0])
 
-    def _measure(self) -> None:
-        w = self.work
-        self.device.launch(self.own.measure_squared, self.model.vertex_count, [w.u, w.truncation.u_end, self.moved])
+    def accept(self) -> None:
+        """Line 16."""
+        w, t, n = self.work, self.work.truncation, self.model.vertex_count
+        self.pairs.expect(w.u, w.u_tilde, t.fraction)
+        self.device.launch(self.own.measure_squared, n, [w.u, t.u_end, self.moved])
         self.largest.sum(self.moved, self.committed)
-
-    def _decide(self, kernel: wp.Kernel, extra: list) -> None:
-        super()._decide(self.own.decide, [self.committed])
+        motion = [t.u_end, t.x_end, w.u, w.x]
+        self.device.launch(self.kernels.commit, n, [w.candidates.overflow, self.numbers, *motion])
+        w.script.advance(w.x_start, w.u, t.fraction)
+        self._lead()
+        self.largest.max(self.lags, self.numbers, status.LAG)
+        s = self.model.settings
+        states = [self.pairs.count, t.passes, w.candidates.overflow, w.script.flags, self.loop.moved, w.clock]
+        limits = [self.model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0, self.committed]
+        self.device.launch_serial(self.own.decide, [*states, *limits, self.numbers, w.count, w.going])
