@@ -85,6 +85,7 @@ PARTS = {
     "kernels": Part(checks.check_kernels, checks.precisions, 30, together=True),
     "ccd": Part(checks.check_ccd, checks.precisions, 30, together=True),
     "solvers": Part(checks.check_solver, checks.solver_cases, 30, together=True),
+    "worlds": Part(checks.check_worlds, checks.world_cases, 20),
     "peer scenes": Part(times.time_scene, times.peer_cases, 25),
     "bundled scenes": Part(times.time_scene, times.bundled_cases, 15),
     "paper scenes": Part(times.time_scene, times.paper_cases, 25),

@@ -14,6 +14,7 @@ import hard_queries
 import numpy as np
 import scipy.sparse.linalg as spla
 import warp as wp
+import worlds
 
 import pdipc
 from pdipc.constraints import (
@@ -35,6 +36,7 @@ from pdipc.linear.solvers import SOLVERS
 from pdipc.reproduce.fig7 import loads, table_cloth
 from pdipc.scene.generators import Box, Grid
 from pdipc.scene.load import bundled_scenes
+from pdipc.scene.worlds import scenes_of
 
 PRECISIONS = ("float32", "float64")
 BEGIN, STEPS = 40, 6  # a scene runs on the CPU to where things touch; then CUDA and CPU take these steps from the same state
@@ -137,6 +139,31 @@ def check_scene(report, place: Device, case: str, carried: Path | None) -> None:
     report.check("intersections", len(pdipc.find_intersections(here, triangles, obstacle)), 0)
     report.check("bits that differ the second time", np.count_nonzero(here != positions(model, begin, STEPS, True)), 0)
     report.check("bits that differ recorded", np.count_nonzero(short != positions(model, begin, UNRECORDED, True)), 0)
+
+
+# --- worlds ---
+
+
+def world_cases(small: bool) -> list[str]:
+    return ["2 worlds" if small else "16 worlds"]
+
+
+def check_worlds(report, place: Device, case: str, carried: Path | None) -> None:
+    """Worlds side by side end at the bits that each has alone; and how long both take."""
+    count, steps = int(case.split()[0]), 4
+    scene, changes = pdipc.Scene(**{**worlds.SCENE, "simulation": {}}), worlds.variants(int(case.split()[0]))
+    together = pdipc.Worlds(scene, changes, place.name)
+    alone = [pdipc.Simulation(one, place.name) for one in scenes_of(scene, changes)]
+    seconds = {}
+    for name, advance in (("together", together.step), ("alone", lambda: [simulation.step() for simulation in alone])):
+        advance()  # records
+        start = time.perf_counter()
+        for _ in range(steps):
+            advance()
+        seconds[name] = (time.perf_counter() - start) / (steps * count)
+    differ = sum(np.count_nonzero(a.positions != b.positions) for a, b in zip(together, alone, strict=True))
+    report.check("bits that differ from those alone", differ, 0)
+    report.add(worlds=count, **{f"ms a step of a world, {name}": 1e3 * each for name, each in seconds.items()})
 
 
 # --- kernels ---

@@ -26,9 +26,11 @@ STRIDES = ("block_dim", "step", "stride", "shares", "size")  # loops with such a
 
 
 def stack(cells=(1, 1, 1), **more):
-    """Two blocks that slide and press on each other and on the floor."""
+    """Two blocks that slide and press on each other and on the floor; the low one may be rigid."""
     young = 1e5
     low = solid("low", (0.1, 0.1, 0.1), cells, at=(0, 0.0505, 0), young=young, friction=0.3)
+    if more.pop("rigid", False):
+        low = {**low, "kind": "rigid", "material": {}}
     high = solid("high", (0.1, 0.1, 0.1), cells, at=(0.01, 0.1512, 0), rotation=(0, 20, 0), young=young, friction=0.3)
     contact = {"activation_distance": 1e-3, **more.pop("contact", {})}
     return scene([low, high], [floor(0.5, friction=0.3)], contact=contact, tolerance=1e-3, **more)
@@ -44,6 +46,7 @@ def after_a_step(described, place):
 
 WAYS = {
     "newton": {},
+    "rigid": {"rigid": True},
     "restitution": {"contact": {"restitution": 0.5}},
     "global": {"contact": {"truncation": "global", "broad_phase": "bvh"}},
     "local-global": {"nonlinear_solver": "local-global", "linear_solver": "pcg"},
@@ -62,6 +65,7 @@ def in_order(way):
     [
         ("newton", "reversed"),
         ("newton", "shuffled"),
+        ("rigid", "shuffled"),
         ("restitution", "shuffled"),
         ("global", "reversed"),
         ("local-global", "shuffled"),
