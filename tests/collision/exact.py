@@ -5,9 +5,11 @@ linearly, so then they stay apart in between. An interval for which no n is foun
 prove what it can, with a margin far above its rounding, then in extended precision, and gives the rest to `pdipc.judge.exact`, where nothing rounds.
 """
 
+from fractions import Fraction
+
 import numpy as np
 
-from pdipc.judge.exact import distance_squared, stays_apart_exactly
+from pdipc.judge.exact import Motion, nearest, stays_apart_exactly
 
 __all__ = ["candidates", "differences", "distance_squared", "stays_apart", "stays_apart_exactly"]
 
@@ -124,3 +126,10 @@ def candidates(q, kind):
         yield across(a, b)
     for k in range(q.shape[1]):
         yield q[:, k]
+
+
+def distance_squared(points: np.ndarray, kind: str, t: float) -> Fraction:
+    """The exact squared distance at time t."""
+    motion, time = Motion(points, kind), Fraction(float(t))
+    r, m = nearest(motion(time.numerator, time.denominator.bit_length() - 1), kind)
+    return Fraction(sum(x * x for x in r), (m * time.denominator * motion.unit) ** 2)

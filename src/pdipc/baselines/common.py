@@ -149,8 +149,3 @@ def sphere(radius, level=3, centre=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndar
 def lumped_tet_masses(vertex_count: int, tets: np.ndarray, volumes: np.ndarray, density: float) -> np.ndarray:
     """(n,) kg: a quarter of each tet's mass to each of its vertices."""
     return np.bincount(tets.ravel(), np.repeat(volumes * density / 4, 4), vertex_count)
-
-
-def lumped_triangle_masses(vertex_count: int, triangles: np.ndarray, areas: np.ndarray, density: float) -> np.ndarray:
-    """(n,) kg: a third of each triangle's mass to each of its vertices. density: kg/m^2."""
-    return np.bincount(triangles.ravel(), np.repeat(areas * density / 3, 3), vertex_count)

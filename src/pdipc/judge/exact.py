@@ -74,13 +74,6 @@ class Motion:
         return [tuple(b * x + a * y for x, y in zip(p, r, strict=True)) for p, r in zip(self.start, self.end, strict=True)]
 
 
-def distance_squared(points: np.ndarray, kind: str, t: float) -> Fraction:
-    """The exact squared distance at time t."""
-    motion, time = Motion(points, kind), Fraction(float(t))
-    r, m = nearest(motion(time.numerator, time.denominator.bit_length() - 1), kind)
-    return Fraction(_dot(r, r), (m * time.denominator * motion.unit) ** 2)
-
-
 def _separates(n, q, bound_num, bound_den) -> bool:
     least = min(_dot(n, r) for r in q)
     return least > 0 and least * least * bound_den > bound_num * _dot(n, n)
