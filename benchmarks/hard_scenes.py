@@ -103,11 +103,9 @@ def squeezed_out() -> pdipc.Scene:
             "motion": path((0.0, (0, 0, 0)), (2.0, (0, -1.08, 0))),
         },
         slab("floor", (2.0, 0.05, 2.0), (0.0, -0.4, 0.0)),
+        turned("plate", [(0.19, -0.24), (0.19, -0.29), (0.9, -0.29), (0.9, -0.24)], look={"opacity": 0.3}),
     ]
-    ring = turned("plate", [(0.19, -0.24), (0.19, -0.29), (0.9, -0.29), (0.9, -0.24)], look={"opacity": 0.3})
-    return scene(
-        "Balls are squeezed through a funnel and out between plates", bodies, [*obstacles, ring], 200, 0.01, friction=0.1
-    )
+    return scene("Balls are squeezed through a funnel and out between plates", bodies, obstacles, 200, 0.01, friction=0.1)
 
 
 def six_plates(side: float, least: float, seconds: float) -> list[dict]:
@@ -268,7 +266,7 @@ def hand() -> Figure:
 
 
 def glove() -> pdipc.Scene:
-    """A hollow glove, open at the wrist, is grasped by two pads that close until they would overlap, lifted, and let go."""
+    """A hollow glove, open at the wrist, is grasped by two pads that close until they would overlap: they have to wait."""
     whole = stuffed(hand().level, *hand().box(), 0.008)
     low = whole.vertices[:, 1].min() + 0.012
     kept = whole.triangles[(whole.vertices[whole.triangles, 1] > low).all(axis=1)]
@@ -284,12 +282,10 @@ def glove() -> pdipc.Scene:
     pads = []
     for side in (-1.0, 1.0):
         reach = -side * 0.062  # 2 mm past the middle
-        motion = path(
-            (0.0, (0, 0, 0)), (0.5, (0, 0, reach)), (1.0, (0, 0.15, reach)), (1.2, (0, 0.15, reach)), (1.5, (0, 0.15, 0))
-        )
+        motion = path((0.0, (0, 0, 0)), (0.5, (0, 0, reach)))
         pads.append(slab(f"pad{'-+'[side > 0]}", (0.06, 0.06, 0.04), (0.0, 0.1, side * 0.08), motion=motion))
     ground = {"name": "floor", "mesh": {"shape": "plane", "size": 1.0}}
-    return scene("A hollow glove grasped until the pads would overlap", [body], [*pads, ground], 200, 0.01, friction=0.5)
+    return scene("A hollow glove grasped until the pads would overlap", [body], [*pads, ground], 100, 0.01, friction=0.5)
 
 
 def tets(file: Path, size: float) -> dict:

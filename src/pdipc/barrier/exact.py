@@ -91,8 +91,17 @@ def kernels(real: Real) -> SimpleNamespace:
                 d = gaps[k]
                 d_hat = activation[k]
                 km = stiffness[k]
-                b1 = barrier.barrier_gradient(d, d_hat)
-                b2 = barrier.barrier_hessian(d, d_hat)
+                foreseen = d < zero
+                b1 = zero
+                b2 = zero
+                if not foreseen:
+                    b1 = barrier.barrier_gradient(d, d_hat)
+                    b2 = barrier.barrier_hessian(d, d_hat)
+                else:
+                    # the tangent of the barrier where the gap will be, seen from here; see `ActivePairs.freeze`
+                    at = scalar(barrier.FORESEEN) * d_hat
+                    b2 = barrier.barrier_hessian(at, d_hat)
+                    b1 = barrier.barrier_gradient(at, d_hat) - b2 * (d + at)
                 slope = mat43()
                 lever = mat43()
                 hessian = km * b2
@@ -105,9 +114,11 @@ def kernels(real: Real) -> SimpleNamespace:
                 bend = zero
                 first_bent = mat43()
                 second_bent = mat43()
-                energy = wp.float64(km) * barrier.barrier(wp.float64(d), wp.float64(d_hat))
+                energy = wp.float64(0.0)
+                if not foreseen:
+                    energy = wp.float64(km) * barrier.barrier(wp.float64(d), wp.float64(d_hat))
                 plain = True
-                if k >= count[2]:
+                if k >= count[2] and not foreseen:
                     e1 = x[q[1]] - x[q[0]]
                     e2 = x[q[3]] - x[q[2]]
                     c, g1, g2 = barrier.parallel_gradient(e1, e2)
@@ -155,7 +166,7 @@ def kernels(real: Real) -> SimpleNamespace:
                             largest = h11
                         lever = (v1 / alpha) * lever + v2 * rest
                         hessian = kappa * wp.max(largest, zero)
-                if plain:
+                if plain and not foreseen:
                     d1, d2 = free_directions(a, k >= count[2])
                     x0 = x[q[0]]
                     p1 = x[q[1]] - x0

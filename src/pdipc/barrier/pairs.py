@@ -62,7 +62,25 @@ def kernels(real: Real) -> SimpleNamespace:
         w = vec4(distance.edge_edge_weights(a0, a1, b0, b1))
         return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
 
+    @wp.func
+    def foreseen(
+        gap: scalar, q: wp.vec4i, a: vec4, limits: vec2, x: wp.array(dtype=vec3), ahead: wp.array(dtype=vec3)
+    ) -> scalar:
+        """The gap, negative where the motion x -> ahead closes it to less than the part FORESEEN of d_hat."""
+        r = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
+        distance = wp.length(r)
+        left = distance - limits[0]
+        closing = scalar(0.0)
+        for s in range(4):
+            closing -= a[s] * wp.dot(r, ahead[q[s]] - x[q[s]]) / distance
+        least_left = scalar(barrier.FORESEEN) * limits[1]
+        if limits[1] > scalar(0.0) and left > least_left and left - closing < least_left:
+            return -left
+        return gap
+
     def measure(kind: str, gap_of):
+        edge_edge = kind == "edge_edge"
+
         @kernel(module, f"measure_{kind}")
         def measure_gaps(
             span: Span,
@@ -71,6 +89,8 @@ def kernels(real: Real) -> SimpleNamespace:
             quads: wp.array(dtype=wp.vec4i),
             limits: wp.array(dtype=vec2),
             faces: wp.array(dtype=wp.int32),
+            ahead: wp.array(dtype=vec3),
+            driven: wp.array(dtype=wp.int32),
             gaps_out: wp.array(dtype=scalar),
             active_out: wp.array(dtype=wp.int32),
             closest_out: wp.array(dtype=scalar),
@@ -85,6 +105,15 @@ def kernels(real: Real) -> SimpleNamespace:
                     gap = far
                     if faces[k] != silent:
                         gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
+                        if ahead:
+                            q = quads[k]
+                            if driven[q[0]] + driven[q[1]] + driven[q[2]] + driven[q[3]] > 0:
+                                a = vec4()
+                                if wp.static(edge_edge):
+                                    a = dist.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                else:
+                                    a = dist.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                gap = foreseen(gap, q, a, limits[k], x, ahead)
                     gaps_out[k] = gap
                     if gap < limits[k][1]:
                         active += 1
@@ -104,6 +133,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ) -> bool:
         """Whether no other triangle of its face is as near to the vertex of pair k, which has its pairs in a row; the first of equals is."""
         nearest = bool(True)
+        own = wp.abs(gaps[k])  # what is foreseen has a minus
         if faces[k] >= 0:
             for way in range(2):
                 step = 1 - 2 * way
@@ -112,7 +142,8 @@ def kernels(real: Real) -> SimpleNamespace:
                     if quads[j][0] != quads[k][0]:
                         j = count
                     else:
-                        if faces[j] == faces[k] and (gaps[j] < gaps[k] or (way == 1 and gaps[j] == gaps[k])):
+                        other = wp.abs(gaps[j])
+                        if faces[j] == faces[k] and (other < own or (way == 1 and other == own)):
                             nearest = False
                         j += step
         return nearest
@@ -509,14 +540,17 @@ class ActivePairs:
         self.energy_sum = Reducer(self.device, real, capacity)
         self.generation += 1
 
-    def freeze(self, candidates: Candidates, x: wp.array) -> None:
+    def freeze(
+        self, candidates: Candidates, x: wp.array, ahead: wp.array | None = None, driven: wp.array | None = None
+    ) -> None:
         """Lists the pairs nearer than d_hat at the feasible x (Algorithm 1, line 5). Recordable.
 
-        Where they do not fit, `candidates.overflow` is set and the list is incomplete.
+        ahead: (n,) where vertices are going; with it those are listed, too, that have a vertex in `driven`, (n,) int32, and will be nearer than
+        FORESEEN d_hat, their gap with a minus. Where they do not fit, `candidates.overflow` is set and the list is incomplete.
         """
         k, device = self.kernels, self.device
         for slot, c in enumerate(candidates.lists):
-            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.found, c.closest]
+            inputs = [c.count, x, c.quads, c.limits, c.faces, ahead, driven, c.gaps, c.found, c.closest]
             device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
             if candidates.surface.has_faces and slot == 0:
                 device.launch_list(k.claim, c.capacity, [c.count, c.quads, c.limits, c.faces, c.gaps, c.found])

@@ -8,6 +8,7 @@ import warp as wp
 from pdipc.device.precision import Scalar, Vec3
 
 EXTENSION = 0.5  # gamma: below this fraction of its gap at the start of an outer iteration the barrier goes on as a parabola
+FORESEEN = 0.5  # of d_hat: where the barrier of a pair is linearized that something scripted is about to close
 PARALLEL = 1.0e-3  # edges whose squared sine is below this are near-parallel
 
 

@@ -174,10 +174,16 @@ def kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def decide(
-        first: int, away: wp.array(dtype=wp.int32), needed_out: wp.array(dtype=wp.int32), renewed_out: wp.array(dtype=wp.int32)
+        first: int,
+        away: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        needed_out: wp.array(dtype=wp.int32),
+        renewed_out: wp.array(dtype=wp.int32),
     ):
         """Clears away for the next time."""
         needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
+        if overflow[0] != 0:
+            needed_out[0] = 0  # what was found stays known, until there is room for it
         if needed_out[0] != 0:
             renewed_out[0] = 1
         for i in range(4):
@@ -327,11 +333,11 @@ class Candidates:
             self.device.launch_list(getattr(self.kernels, f"{own.kind}_limits"), own.capacity, inputs)
 
     def check(self, x0: wp.array, x1: wp.array) -> None:
-        """needed[0] = 0 if the list holds for the motion x0 -> x1, else 1.
+        """needed[0] = 0 if the list holds for the motion x0 -> x1, or one has overflowed before, else 1.
 
         It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
         """
         k = self.kernels
         inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), self.away]
         self.device.launch(k.depart, len(x0), inputs)
-        self.device.launch_serial(k.decide, [self.away, self.needed, self.renewed])
+        self.device.launch_serial(k.decide, [self.away, self.overflow, self.needed, self.renewed])

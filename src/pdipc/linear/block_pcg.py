@@ -44,7 +44,7 @@ class BlockPcg:
     """Solves K p = b on the free vertices by launches alone.
 
     tolerance: relative, of sqrt(r . M^-1 r). most: iterations of a solve. iterations: (1,) int32 on the device, done since it was last set to
-    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, and ended there. affine: bodies whose vertices follow
+    zero. indefinite: (1,) int32, whether the last solve met a direction of negative curvature, in matrix or preconditioner, and ended there. affine: bodies whose vertices follow
     four of them, which alone are then unknowns.
     """
 
@@ -144,6 +144,7 @@ class BlockPcg:
             sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits[1:], *status])
 
         self.device.loop(self._going, iterate)
+        self.device.launch_serial(k.judge_preconditioner, [self._numbers, self.indefinite])
         if self.affine is not None:
             self.affine.expand(p)
 
@@ -301,6 +302,8 @@ def kernels(real: Real) -> SimpleNamespace:
             going_out[0] = 0
             if norm > tolerance * reference or not wp.isfinite(gamma):
                 going_out[0] = 1
+            if gamma < scalar(0.0):
+                indefinite_out[0] = 1
 
     @wp.kernel(module=module)
     def find_alpha(
@@ -323,6 +326,12 @@ def kernels(real: Real) -> SimpleNamespace:
                 numbers[pcg.ALPHA] = scalar(0.0)
                 left[0] = 1
                 indefinite_out[0] = 1
+
+    @wp.kernel(module=module)
+    def judge_preconditioner(first: int, numbers: wp.array(dtype=scalar), indefinite_out: wp.array(dtype=wp.int32)):
+        """A negative r . M^-1 r, which also ends the solve, tells of a preconditioner that is indefinite, as the matrix then is."""
+        if numbers[pcg.GAMMA] < scalar(0.0):
+            indefinite_out[0] = 1
 
     @wp.kernel(module=module)
     def multiply(
@@ -383,6 +392,7 @@ def kernels(real: Real) -> SimpleNamespace:
         move_rigidly=move_rigidly,
         begin=begin,
         find_alpha=find_alpha,
+        judge_preconditioner=judge_preconditioner,
         multiply=multiply,
         correct=correct,
         product=product,

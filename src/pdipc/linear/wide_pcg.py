@@ -263,6 +263,11 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             if not (residual > tolerance) or left <= 0:
                 going = 0
         alpha = gamma / curvature
+        if gamma < scalar(0.0):
+            # nor with a preconditioner that has one
+            going = 0
+            if tells:
+                indefinite_out[0] = 1
         if going != 0 and not (curvature > scalar(0.0) or wp.isnan(curvature)):
             # no step along a direction of negative curvature
             going = 0

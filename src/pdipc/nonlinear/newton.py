@@ -52,6 +52,8 @@ SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
+CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
+MOST_STRETCH = 1024.0
 RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below that
 LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
@@ -110,6 +112,73 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[i] = scale / h * (z[i] - u[i]) - scale * damping * (u[i] - rest[i])
         energy = wide(scale) / wide(h) * wide_square(u[i], z[i]) + wide(scale) * wide(damping) * wide_square(u[i], rest[i])
         energy_out[i] = wide(0.5) * energy + beside[i]
+
+    @wp.kernel(module=module)
+    def measure(
+        first: int,
+        p: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        rhs: wp.array(dtype=vec3),
+        inertial: wp.array(dtype=vec3),
+        moved_out: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=scalar),
+        scale_out: wp.array(dtype=scalar),
+    ):
+        """How far each free vertex wants to go, and the forces on it; what is no number is infinitely far from its goal."""
+        i = first + wp.tid()
+        moved = wp.length(p[i])
+        if not (moved < scalar(1.0e30)):
+            moved = scalar(wp.inf)
+        moved_out[i] = moved
+        if free[i] == scalar(0.0) and moved < scalar(wp.inf):
+            moved_out[i] = scalar(0.0)
+        force_out[i] = wp.length(rhs[i])
+        scale_out[i] = wp.length(inertial[i])
+
+    @wp.kernel(module=module)
+    def lengthen(
+        first: int,
+        projected: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=scalar),
+        stretch_out: wp.array(dtype=scalar),
+    ):
+        """How many times its length a step is tried with. Where the potential curves down, the projected Hessian has a bound instead, and steps
+        creep, all alike or growing: as long as they do, each that descends is followed by one twice as long.
+        """
+        creeps = count[status.OUTER] > 0 and numbers[status.MOVED] >= scalar(CREEP) * numbers[status.MOVED_BEFORE]
+        if projected[0] != 0 and hits[0] == 0 and attempts[0] == 1 and creeps:
+            stretch_out[0] = wp.min(scalar(2.0) * stretch_out[0], scalar(MOST_STRETCH))
+        else:
+            stretch_out[0] = scalar(1.0)
+
+    @wp.kernel(module=module)
+    def look_ahead(
+        first: int,
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        mover: wp.array(dtype=wp.int32),
+        drive: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        ahead_out: wp.array(dtype=vec3),
+        driven_out: wp.array(dtype=wp.int32),
+    ):
+        """Where vertices are going: what is driven to its target, others as inertia has it in the first iteration, and nowhere later."""
+        i = first + wp.tid()
+        place = base[i] + u[i]
+        driven_out[i] = 0
+        if free[i] == scalar(0.0):
+            if drive[wp.max(mover[i], 0)] != 0 and mover[i] >= 0:
+                place = target[i]
+                driven_out[i] = 1
+        elif count[status.OUTER] == 0:
+            place = base[i] + z[i]
+        ahead_out[i] = place
 
     @wp.kernel(module=module)
     def begin(
@@ -224,27 +293,25 @@ def kernels(real: Real) -> SimpleNamespace:
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
-        rhs: wp.array(dtype=vec3),
-        inertial: wp.array(dtype=vec3),
         body: wp.array(dtype=wp.int32),
         center: wp.array(dtype=wp.vec3d),
         turn: wp.array(dtype=wp.vec3d),
         target: wp.array(dtype=vec3),
         mover: wp.array(dtype=wp.int32),
         drive: wp.array(dtype=wp.int32),
+        stretch: wp.array(dtype=scalar),
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
-        moved_out: wp.array(dtype=scalar),
-        force_out: wp.array(dtype=scalar),
-        scale_out: wp.array(dtype=scalar),
     ):
-        """x~ = x + p, and what makes the rotation of whole bodies one that does not stretch them; how far each free vertex wants to go, and the forces on it. What is no number stays, infinitely far from its goal."""
+        """x~ = x + p, and what makes the rotation of whole bodies one that does not stretch them; and the forces on each vertex. What is no number stays."""
         i = first + wp.tid()
         step = p[i]
         moved = wp.length(step)
         if not (moved < scalar(1.0e30)):
             moved = scalar(wp.inf)
             step = vec3()
+        if free[i] > scalar(0.0):
+            step = stretch[0] * step
         b = body[i]
         if b >= 0 and moved < scalar(wp.inf):
             step += curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)])
@@ -253,11 +320,6 @@ def kernels(real: Real) -> SimpleNamespace:
             u_tilde = target[i] - base[i]  # to the bit, so that it is known to have arrived
         u_tilde_out[i] = u_tilde
         x_tilde_out[i] = base[i] + u_tilde
-        moved_out[i] = moved
-        if free[i] == scalar(0.0) and moved < scalar(wp.inf):
-            moved_out[i] = scalar(0.0)
-        force_out[i] = wp.length(rhs[i])
-        scale_out[i] = wp.length(inertial[i])
 
     @wp.kernel(module=module)
     def judge(
@@ -437,11 +499,24 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         mover: wp.array(dtype=wp.int32),
+        body: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        squeezed: wp.array(dtype=wp.int32),
+        restraint: wp.array(dtype=scalar),
         crowded_out: wp.array(dtype=wp.int32),
     ):
-        """Which movers have a pair that is squeezed, and that what is left of their way would close; whoever writes, writes the same."""
+        """Which movers have a pair that is squeezed, or whose body is held back or was just stopped by one, and that what is left of their
+        way would close; whoever writes, writes the same.
+        """
         k = first + wp.tid()
-        if k < pairs[0] and gaps[k] < scalar(SQUEEZED) * activation[k]:
+        waits = False
+        if k < pairs[0]:
+            waits = gaps[k] < scalar(SQUEEZED) * activation[k]
+            for s in range(4):
+                b = body[quads[k][s]]
+                if b >= 0:
+                    waits = waits or restraint[b] > scalar(0.0) or squeezed[label[b]] != 0
+        if waits:
             closing = scalar(0.0)
             for s in range(4):
                 i = quads[k][s]
@@ -451,6 +526,12 @@ def kernels(real: Real) -> SimpleNamespace:
                 i = quads[k][s]
                 if free[i] == scalar(0.0) and closing < scalar(0.0):
                     crowded_out[mover[i]] = 1
+
+    @wp.kernel(module=module)
+    def any_driven(first: int, movers: int, drive: wp.array(dtype=wp.int32), any_out: wp.array(dtype=wp.int32)):
+        any_out[0] = 0
+        for m in range(movers):
+            any_out[0] = wp.max(any_out[0], drive[m])
 
     @wp.kernel(module=module)
     def clear(first: int, flags_out: wp.array(dtype=wp.int32)):
@@ -493,6 +574,7 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         bodies: int,
         label: wp.array(dtype=wp.int32),
+        driven: wp.array(dtype=wp.int32),
         squeezed: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         least: wp.array(dtype=scalar),
@@ -510,7 +592,7 @@ def kernels(real: Real) -> SimpleNamespace:
             r = scalar(RELEASE) * restraint[b]
             if r < scalar(RELEASED):
                 r = scalar(0.0)
-            if squeezed[island] != 0 and attempts[0] > 1 and least[island] < scalar(RESTRAIN):
+            if squeezed[island] != 0 and attempts[0] > 1 and least[island] < scalar(RESTRAIN) and driven[b] == 0:
                 r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
                 r = wp.min(r, scalar(MOST_RESTRAINT))
             restraint[b] = r
@@ -727,7 +809,10 @@ class Newton:
             self.renew,
             self.restrained,
             self.lowered,
-        ) = (zeros(wp.int32, 1) for _ in range(8))
+            self.driving,
+        ) = (zeros(wp.int32, 1) for _ in range(9))
+        self.driven = zeros(wp.int32)
+        self.stretch = zeros(scalar, 1)
         self.nobody = zeros(wp.int32, len(work.script.movers))
         self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
@@ -813,6 +898,19 @@ class Newton:
             self.device.when(self._lags_now(), self.friction.lag)
             self.friction.differentiate(w.u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
+        if self.work.script.moves:
+            self.device.launch_serial(self.kernels.any_driven, [len(w.script.movers), w.script.drive, self.driving])
+            self.device.when(self.driving, self._foresee)
+
+    def _foresee(self) -> None:
+        """What is scripted will push what is in its way: pairs that it is about to close push already, where it will be."""
+        w, model = self.work, self.model
+        inputs = [w.x_start, w.u, w.z, w.script.target, model.free, w.script.mover, w.script.drive, w.count]
+        self.device.launch(self.kernels.look_ahead, model.vertex_count, [*inputs, w.x_tilde, self.driven])
+        w.candidates.check(w.x, w.x_tilde)
+        self.device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, w.x_tilde))
+        self.pairs.freeze(w.candidates, w.x, w.x_tilde, self.driven)
+        self.pairs.differentiate(w.x)
 
     def _last(self) -> list:
         """What is known of the last outer iteration."""
@@ -837,11 +935,14 @@ class Newton:
         if self.bodies:
             inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p, self.center, self.turn]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
-        inputs = [w.x_start, w.u, self.p, model.free, self.rhs, self.inertial, self.islands.body, self.center, self.turn]
-        inputs += [w.script.target, w.script.mover, w.script.drive]
-        device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde, self.moved, self.forces, self.scales])
+        device.launch(k.measure, n, [self.p, model.free, self.rhs, self.inertial, self.moved, self.forces, self.scales])
         wanted = [self.moved, self.forces, self.scales]
         self.largest_of_three.find(wanted, self.numbers, [status.MOVED, status.FORCE, status.FORCE_SCALE])
+        states = [self.project, self.hits, self.attempts, w.count]
+        device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
+        inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn]
+        inputs += [w.script.target, w.script.mover, w.script.drive, self.stretch]
+        device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
     def _assemble(self) -> None:
         self.matrix.restrain(self.islands.body, self.restraint)
@@ -944,7 +1045,8 @@ class Newton:
             p = self.pairs
             device.launch(k.clear, len(w.script.movers), [w.script.crowded])
             inputs = [p.count, p.quads, model.free, p.gaps, p.activation, p.weights, p.normals]
-            inputs += [w.u, w.x_start, w.script.target, w.script.mover, w.script.crowded]
+            inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
+            inputs += [self.squeezed, self.restraint, w.script.crowded]
             device.launch(k.crowd, p.capacity, inputs)
         w.script.advance(w.x_start, w.u, t.fraction)
         s = model.settings
@@ -952,7 +1054,7 @@ class Newton:
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
         times = [w.candidates.overflow, w.clock]
         device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])
-        which = [self.islands.label, self.squeezed, self.attempts, self.island_least]
+        which = [self.islands.label, self.islands.driven, self.squeezed, self.attempts, self.island_least]
         device.launch_serial(k.restrain, [self.bodies, *which, self.restraint, self.restrained])
 
 
