@@ -171,7 +171,7 @@ def compose(folder: Path) -> None:
     """Draws each run, and all in one picture."""
     import matplotlib.pyplot as plt
 
-    from pdipc.output.render import render, settings_of
+    from pdipc.pictures.render import render, settings_of
     from pdipc.output.results import open_run
 
     runs = {name: open_run(folder / name) for name in hard_scenes.SHOWN if (folder / name).is_dir()}

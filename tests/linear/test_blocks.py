@@ -211,6 +211,22 @@ def test_a_direction_of_negative_curvature_is_reported():
         assert solver.indefinite.numpy()[0] == indefinite
 
 
+def test_a_preconditioner_of_negative_curvature_is_reported():
+    """Pressed harder, single vertices are unstable too: then r . M^-1 r turns negative, which is no small residual."""
+    sheet = cloth("sheet", [0.3, 0.3], [4, 4], material={"membrane": "springs", "membrane_stiffness": 1e4})
+    model = pdipc.build(scene([sheet]), "cpu")
+    work, x = Work(model), model.initial_state().positions
+    u = wp.array(-0.8 * x.numpy(), dtype=wp.vec3d, device="cpu")
+    work.method.matrix.assemble(x, u, NO)
+    assert np.linalg.eigvalsh(work.method.matrix.diagonal.numpy()[: len(x)]).max() < 0.0
+    solver, b = work.method.solver, np.zeros((len(x), 3))
+    b[3, 1] = 1.0
+    p = wp.zeros(len(x) + 1, dtype=wp.vec3d, device="cpu")
+    solver.prepare(x, [])
+    solver.solve(p, wp.array(b, dtype=wp.vec3d, device="cpu"), [], 0.0, NO)
+    assert solver.indefinite.numpy()[0] == 1
+
+
 @pytest.mark.parametrize("motion", ["translation", "rotation"])
 def test_rigid_motions_of_a_stiff_body_in_single_precision(motion):
     """Steel, 3 m from the origin: what moves it rigidly is found as such, at once. Positions alone would lie: their rounding is stress."""
