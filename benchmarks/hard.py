@@ -171,8 +171,8 @@ def compose(folder: Path) -> None:
     """Draws each run, and all in one picture."""
     import matplotlib.pyplot as plt
 
-    from pdipc.pictures.render import render, settings_of
     from pdipc.output.results import open_run
+    from pdipc.pictures.render import render, settings_of
 
     runs = {name: open_run(folder / name) for name in hard_scenes.SHOWN if (folder / name).is_dir()}
     columns = 4

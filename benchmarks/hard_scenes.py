@@ -71,7 +71,7 @@ def mat() -> pdipc.Scene:
         for side in (-1.0, 1.0)
     ]
     body = solid("mat", box((1.0, 0.016, 0.6), (36, 1, 22)), SOFT, pins=pins)
-    return scene("A mat is twisted", [body], steps=160, h=0.025)
+    return scene("A mat is twisted", [body], steps=100, h=0.04)
 
 
 def rods() -> pdipc.Scene:
@@ -84,7 +84,7 @@ def rods() -> pdipc.Scene:
             for side in (-1.0, 1.0)
         ]
         bodies.append(solid(f"rod{k}", box((1.0, 0.04, 0.04), (36, 2, 2)), RUBBER, translation=(0.0, y, z), pins=pins))
-    return scene("Four rods are twisted about each other", bodies, steps=160, h=0.025)
+    return scene("Four rods are twisted about each other", bodies, steps=100, h=0.04)
 
 
 def squeezed_out() -> pdipc.Scene:
@@ -105,7 +105,7 @@ def squeezed_out() -> pdipc.Scene:
         slab("floor", (2.0, 0.05, 2.0), (0.0, -0.4, 0.0)),
         turned("plate", [(0.19, -0.24), (0.19, -0.29), (0.9, -0.29), (0.9, -0.24)], look={"opacity": 0.3}),
     ]
-    return scene("Balls are squeezed through a funnel and out between plates", bodies, obstacles, 200, 0.01, friction=0.1)
+    return scene("Balls are squeezed through a funnel and out between plates", bodies, obstacles, 110, 0.02, friction=0.1)
 
 
 def six_plates(side: float, least: float, seconds: float) -> list[dict]:
@@ -136,7 +136,7 @@ def compactor() -> pdipc.Scene:
         ),
         solid("mat", box((0.6, 0.03, 0.6), (12, 1, 12)), SOFT, translation=(0.0, -0.4, 0.0)),
     ]
-    return scene("A compactor of six plates, and back", bodies, six_plates(1.0, 0.1, 1.0), 200, 0.01)
+    return scene("A compactor of six plates, and back", bodies, six_plates(1.0, 0.1, 1.0), 100, 0.02)
 
 
 def rollers() -> pdipc.Scene:
@@ -149,7 +149,7 @@ def rollers() -> pdipc.Scene:
         more = {"rotation": (90, 0, 0), "translation": (side * 0.36, 0.0, 0.0), "motion": motion, "look": {"opacity": 0.4}}
         obstacles.append({"name": f"roller{'-+'[side > 0]}", "mesh": drum, **more})
     obstacles.append(slab("floor", (3.0, 0.1, 3.0), (0.0, -0.8, 0.0)))
-    return scene("A soft body on counter-rotating rollers", [body], obstacles, 150, 0.01, friction=0.5)
+    return scene("A soft body on counter-rotating rollers", [body], obstacles, 75, 0.02, friction=0.5)
 
 
 def ball_on_mat() -> pdipc.Scene:
@@ -162,7 +162,7 @@ def ball_on_mat() -> pdipc.Scene:
         "translation": (0.05, 0.4, 0.02),
     }
     thin = solid("mat", box((1.0, 0.01, 1.0), (24, 1, 24)), {**RUBBER, "young_modulus": 4e5}, pins=pins)
-    return scene("A heavy ball on a thin held mat", [thin, {**ball, "material": {"density": 5000.0}}], steps=150, h=0.01)
+    return scene("A heavy ball on a thin held mat", [thin, {**ball, "material": {"density": 5000.0}}], steps=60, h=0.02)
 
 
 def cloths_in_funnel() -> pdipc.Scene:
@@ -181,7 +181,7 @@ def cloths_in_funnel() -> pdipc.Scene:
     pusher = {"name": "pusher", "mesh": {"shape": "sphere", "radius": 0.1, "cells": 8}, "translation": (0.0, 0.55, 0.0)}
     pusher["motion"] = path((0.0, (0, 0, 0)), (0.2, (0, 0, 0)), (1.2, (0, -0.6, 0)))
     return scene(
-        "Stacked cloths pressed into a funnel", cloths, [funnel("funnel", 0.5, 0.16, 0.3, 0.5), pusher], 130, 0.01, friction=0.1
+        "Stacked cloths pressed into a funnel", cloths, [funnel("funnel", 0.5, 0.16, 0.3, 0.5), pusher], 65, 0.02, friction=0.1
     )
 
 
@@ -228,7 +228,7 @@ def folded() -> pdipc.Scene:
         "pins": [{"select": {"box": ((0.49, -1, -1), (0.51, 1, 1))}, "motion": lead}],
     }
     ground = {"name": "floor", "mesh": {"shape": "plane", "size": 4.0}}
-    return scene("A stiff sheet folded by a led edge", [sheet], [ground], 160, 0.01, friction=0.4)
+    return scene("A stiff sheet folded by a led edge", [sheet], [ground], 80, 0.02, friction=0.4)
 
 
 def cards() -> pdipc.Scene:
@@ -253,7 +253,7 @@ def cards() -> pdipc.Scene:
         "material": {"density": 3000.0},
     }
     table = {"name": "table", "mesh": {"shape": "plane", "size": 2.0}}
-    return scene("A deck of cards hit by a ball", [*deck, ball], [table], 120, 0.004, friction=0.2, activation_distance=2e-4)
+    return scene("A deck of cards hit by a ball", [*deck, ball], [table], 60, 0.004, friction=0.2, activation_distance=2e-4)
 
 
 def hand() -> Figure:
@@ -285,7 +285,7 @@ def glove() -> pdipc.Scene:
         motion = path((0.0, (0, 0, 0)), (0.5, (0, 0, reach)))
         pads.append(slab(f"pad{'-+'[side > 0]}", (0.06, 0.06, 0.04), (0.0, 0.1, side * 0.08), motion=motion))
     ground = {"name": "floor", "mesh": {"shape": "plane", "size": 1.0}}
-    return scene("A hollow glove grasped until the pads would overlap", [body], [*pads, ground], 100, 0.01, friction=0.5)
+    return scene("A hollow glove grasped until the pads would overlap", [body], [*pads, ground], 60, 0.01, friction=0.5)
 
 
 def tets(file: Path, size: float) -> dict:
@@ -301,7 +301,7 @@ def compactor_data(data: Path) -> pdipc.Scene:
         solid("armadillo", tets(data / "meshes/tet/armadillo_4k.npz", 0.7), SOFT, translation=(-0.1, 0.0, -0.15)),
         solid("rod", tets(data / "meshes/tet/rod_2k.npz", 0.8), SOFT, translation=(0.0, 0.1, 0.4)),
     ]
-    return scene("An Armadillo and a rod in a compactor, and back", bodies, six_plates(1.0, 0.1, 1.0), 200, 0.01)
+    return scene("An Armadillo and a rod in a compactor, and back", bodies, six_plates(1.0, 0.1, 1.0), 100, 0.02)
 
 
 SCENES = {
@@ -319,16 +319,16 @@ SCENES = {
 }
 DATA_SCENES = {"compactor_data": compactor_data}
 SHOWN = {
-    "mat": 120,
-    "rods": 120,
-    "funnel": 120,
-    "compactor": 95,
-    "rollers": 70,
-    "ball_on_mat": 40,
-    "cloths": 110,
+    "mat": 70,
+    "rods": 70,
+    "funnel": 70,
+    "compactor": 45,
+    "rollers": 38,
+    "ball_on_mat": 20,
+    "cloths": 55,
     "table_cloth": 50,
-    "folded": 130,
-    "cards": 40,
-    "glove": 70,
-    "compactor_data": 95,
+    "folded": 65,
+    "cards": 30,
+    "glove": 48,
+    "compactor_data": 45,
 }  # a frame of each to draw

@@ -68,11 +68,11 @@ def kernels(real: Real) -> SimpleNamespace:
     ) -> scalar:
         """The gap, negative where the motion x -> ahead closes it to less than the part FORESEEN of d_hat."""
         r = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
-        distance = wp.length(r)
-        left = distance - limits[0]
+        apart = wp.length(r)
+        left = apart - limits[0]
         closing = scalar(0.0)
         for s in range(4):
-            closing -= a[s] * wp.dot(r, ahead[q[s]] - x[q[s]]) / distance
+            closing -= a[s] * wp.dot(r, ahead[q[s]] - x[q[s]]) / apart
         least_left = scalar(barrier.FORESEEN) * limits[1]
         if limits[1] > scalar(0.0) and left > least_left and left - closing < least_left:
             return -left
@@ -110,9 +110,9 @@ def kernels(real: Real) -> SimpleNamespace:
                             if driven[q[0]] + driven[q[1]] + driven[q[2]] + driven[q[3]] > 0:
                                 a = vec4()
                                 if wp.static(edge_edge):
-                                    a = dist.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                    a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                                 else:
-                                    a = dist.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]])
+                                    a = vec4(distance.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                                 gap = foreseen(gap, q, a, limits[k], x, ahead)
                     gaps_out[k] = gap
                     if gap < limits[k][1]:

@@ -316,6 +316,7 @@ class Candidates:
         """Makes room for what overflowed; returns whether anything had to."""
         if not self.broad_phase.grow():
             return False
+        self.overflow.zero_()
         self._allocate()
         self.invalidate()
         return True

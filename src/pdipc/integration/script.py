@@ -14,7 +14,8 @@ Vertices of a pin turn about each other, not past an obstacle's arcs: they are o
 activation distance.
 
 Who waits: a mover that was stopped goes on in every second outer iteration, so that the others make way in between, as long as no pair of it
-is squeezed and for at most TRIES times from one waypoint to the next; then it is late. It follows its script from where it was
+is squeezed, and no body that it would push on is held back (`nonlinear.newton`) or was just stopped as a whole, and for at most TRIES times from
+one waypoint to the next; then it is late. It follows its script from where it was
 stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again.
 """
 

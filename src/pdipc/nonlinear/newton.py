@@ -12,6 +12,13 @@ microns cost more than they win, and a stretched body resists the rest of its ro
 body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
 p by its square, so it descends as p does, and solves as fast as p where that is small.
 
+Where the Hessian is indefinite the projected one takes its place, whose bound makes steps creep along directions that the potential curves down in; as
+long as they do not shrink, each is tried with twice the length of the last.
+
+What is scripted goes as far as it can in an iteration, and Newton's step already sees what it will meet: a pair that it is about to close
+acts with the tangent that its barrier will have where the gap will be half of d_hat. So bodies move out of the way with what pushes them. That
+is the potential of no state, and need not be: it only chooses where to go.
+
 After truncation Phi is compared, island by island. Where it rose, the island goes back along the same direction: first all of it to the least
 fraction that truncation left to one of its vertices, then by halves. What CCD has not proven is proven anew. So every outer iteration descends,
 unless a script moves something that the island may touch: then the potential itself has changed.
