@@ -310,7 +310,7 @@ def kernels(real: Real) -> SimpleNamespace:
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
     ):
-        """x~ = x + p, and what makes the rotation of whole bodies one that does not stretch them; and the forces on each vertex. What is no number stays."""
+        """x~ = x + p, and what makes the rotation of whole bodies one that does not stretch them. What is no number stays."""
         i = first + wp.tid()
         step = p[i]
         moved = wp.length(step)
