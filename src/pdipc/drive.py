@@ -81,8 +81,7 @@ def stepping(
 ) -> Generator[Graph, None, StepResult]:
     """`step` as a task (`launch.Task`), so that the steps of several simulations go side by side."""
     _belongs(model, state, work)
-    motions = yield from _solve(model, state, work, observe is not None)
-    report = work.report.numpy().tolist()
+    report, motions = yield from _solve(model, state, work, observe is not None)
     if report[FOREIGN]:
         _judge(model, state, work)
     if observe is not None:
@@ -91,8 +90,8 @@ def stepping(
     return _result(model, state, work, report, into)
 
 
-def _solve(model: Model, state: State, work: Work, observed: bool) -> Generator[Graph, None, list[tuple[wp.array, wp.array]]]:
-    """Takes the step, again from its start whenever a list was full; returns the motions that were committed, where they are observed."""
+def _solve(model: Model, state: State, work: Work, observed: bool) -> Generator[Graph, None, tuple[list[float], list]]:
+    """Takes the step, again from its start whenever a list was full; returns the report, and the motions that were committed, where they are observed."""
     work.foreign.zero_()
     model.device.launch(work.kernels.compare, model.vertex_count, [state.positions, work.x, work.foreign])
     work.set_scripted(state)
@@ -114,8 +113,9 @@ def _solve(model: Model, state: State, work: Work, observed: bool) -> Generator[
                 yield from work.run(algorithm.outer_iteration)
                 motions.append((begin, wp.clone(work.x)))
             yield from work.run(algorithm.finish)
-        if int(work.report.numpy()[status.STATUS]) != status.OVERFLOW:
-            return motions
+        report = work.report.numpy().tolist()
+        if report[status.STATUS] != status.OVERFLOW:
+            return report, motions
         if not work.grow():  # a list was full: with more room, the step is taken again
             raise AssertionError("a list overflowed that had room")
 
