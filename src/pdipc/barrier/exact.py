@@ -22,6 +22,8 @@ from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
+from pdipc.linear import contact_rows
+from pdipc.linear.contact_rows import ContactRows
 from pdipc.linear.wide_pcg import Operator
 
 
@@ -400,6 +402,7 @@ class BarrierTerm(ActivePairs):
         self.bend = wp.zeros(capacity, dtype=real.scalar, device=device)
         self.first_bent, self.second_bent = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
         self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
+        self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.kappa), capacity)
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""
@@ -420,6 +423,13 @@ class BarrierTerm(ActivePairs):
         """(n,) vec3, N: what the frozen pairs exert at x on each vertex."""
         self.differentiate(x)
         return self.force_of_vertex
+
+    def assemble(self):
+        """See `linear.block_pcg.Coupling`."""
+        r, inputs = self.rows, [self.operand(), self.free, self.entries]
+        assert r is not None
+        self.device.launch(assembly(self.real), len(self.ends), [*inputs, r.lengths, r.columns, r.values], grain=16)
+        return r.operand(self.real, self.ends)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p at free vertices, pair by pair and gathered per vertex. Recordable."""
@@ -498,6 +508,25 @@ def operator(real: Real) -> Operator:
         return total_share(v, o.ends, o.shares)
 
     return Operator(Operand, feel, exert)
+
+
+@functools.cache
+def assembly(real: Real) -> wp.Kernel:
+    """The kernel that fills the rows of the Hessian."""
+    mat33, row, Operand = real.mat33, kernels(real).row, operator(real).Operand
+    identity = wp.constant(mat33(1, 0, 0, 0, 1, 0, 0, 0, 1))
+
+    @wp.func
+    def block_of(o: Operand, k: int, s: int, t: int) -> mat33:
+        block = o.hessian[k] * wp.outer(row(o.lever[k], s), row(o.lever[k], t))
+        if o.project[0] == 0 and o.bend[k] > real.scalar(0.0):
+            n = o.normals[k]
+            block += o.bend[k] * wp.outer(row(o.first_bent[k], s), row(o.first_bent[k], t))
+            block += o.bend[k] * wp.outer(row(o.second_bent[k], s), row(o.second_bent[k], t))
+            block -= (o.bend[k] * o.weights[k][s] * o.weights[k][t]) * (identity - wp.outer(n, n))
+        return block
+
+    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Operand, block_of)
 
 
 @functools.cache

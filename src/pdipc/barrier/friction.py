@@ -16,6 +16,8 @@ from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
+from pdipc.linear import contact_rows
+from pdipc.linear.contact_rows import ContactRows
 from pdipc.linear.wide_pcg import Operator
 
 
@@ -271,6 +273,7 @@ class FrictionTerm:
         self.response = make(real.vec3)
         wide = 4 * capacity if self.device.wide else 1
         self.places, self.shares = make(wp.int32, wide), make(real.vec3, wide)
+        self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.ends), capacity)
 
     def lag(self) -> None:
         """Launches the copy of the barrier's pairs, with the normal forces that they have now."""
@@ -296,6 +299,13 @@ class FrictionTerm:
         """The forces where they were last differentiated. Not recordable."""
         quads, weights, force = listed(int(self.count.numpy()[0]), self.quads, self.weights, self.force)
         return Exerted(quads, weights[:, :, None] * force[:, None, :])
+
+    def assemble(self):
+        """See `linear.block_pcg.Coupling`."""
+        r, inputs = self.rows, [self.operand(), self.source.free, self.entries]
+        assert r is not None
+        self.device.launch(assembly(self.real), len(self.ends), [*inputs, r.lengths, r.columns, r.values], grain=16)
+        return r.operand(self.real, self.ends)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (friction Hessian) p at free vertices. Recordable."""
@@ -347,6 +357,18 @@ def operator(real: Real) -> Operator:
         return total_share(v, o.ends, o.shares)
 
     return Operator(Operand, feel, exert)
+
+
+@functools.cache
+def assembly(real: Real) -> wp.Kernel:
+    """The kernel that fills the rows of the Hessian."""
+    Operand = operator(real).Operand
+
+    @wp.func
+    def block_of(o: Operand, k: int, s: int, t: int) -> real.mat33:
+        return (o.weights[k][s] * o.weights[k][t]) * o.block[k]
+
+    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Operand, block_of)
 
 
 @functools.cache

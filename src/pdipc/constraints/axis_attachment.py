@@ -94,6 +94,8 @@ class Rails:
     diagonal: (n,) 3x3 blocks, kg/s^2.
     """
 
+    rows = None
+
     def __init__(self, device: Device, real: Real, n: int, s: ConstraintSet):
         self.device, self._kernels = device, kernels(real)
         blocks = np.zeros((n, 3, 3))

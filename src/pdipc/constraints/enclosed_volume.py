@@ -113,7 +113,7 @@ class Cavities:
     diagonal: None, it adds nothing to the preconditioner: one direction more costs conjugate gradients an iteration or two.
     """
 
-    diagonal = None
+    diagonal = rows = None
 
     def __init__(self, device: Device, real: Real, n: int, s: ConstraintSet):
         self.device, self.real, self._kernels = device, real, kernels(real)

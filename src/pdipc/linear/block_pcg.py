@@ -18,6 +18,8 @@ from pdipc.linear import pcg
 from pdipc.linear.affine import AffineBodies
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.rigid_modes import RigidModes
+from pdipc.linear.contact_rows import ContactRows, nothing
+from pdipc.linear.contact_rows import kernels as row_kernels
 
 LOOSE = 10.0  # how much less exact a solve is that is far from the end
 
@@ -26,6 +28,12 @@ class Coupling(Protocol):
     """What is added to the matrix beside the blocks of elements: low-rank terms of pairs in contact, or of closed surfaces."""
 
     diagonal: wp.array | None  # (n,) 3x3 blocks of the diagonal, kg/s^2; None where the preconditioner does without
+
+    rows: ContactRows | None  # where the Hessian is assembled; None where a product is made by `apply`
+
+    def assemble(self) -> Any:
+        """Launches the blocks of `rows` as the Hessian is now; returns what a product works on."""
+        ...
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """Launches y += (contact Hessian) p."""
@@ -115,12 +123,15 @@ class BlockPcg:
         tolerance will do. tolerance: where another one than the solver's own is wanted.
         """
         k, sums, m = self._kernels, self.sums, self.matrix
-        rows = [m.offsets, m.columns, m.values, m.held]
+        assembled = [c.assemble() for c in couplings if c.rows is not None]
+        couplings = [c for c in couplings if c.rows is None]
+        assembled += [nothing(self.real)] * (2 - len(assembled))
+        rows = [m.offsets, m.columns, m.values, m.held, *assembled]
         status = [self._first, self._left, self.iterations, self._residual, self._going]
         limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
 
         def begin(again: int) -> None:
-            self._find_residual(p, b, couplings)
+            self._find_residual(p, b, couplings, assembled)
             if self.affine is not None:
                 self.affine.fold(self._r)
             self._precondition()
@@ -148,14 +159,15 @@ class BlockPcg:
         if self.affine is not None:
             self.affine.expand(p)
 
-    def _find_residual(self, p: wp.array, b: wp.array, couplings: list[Coupling]) -> None:
+    def _find_residual(self, p: wp.array, b: wp.array, couplings: list[Coupling], assembled: list) -> None:
+        """r = b - K p. couplings: those without rows; assembled: the rows of two others."""
         k, m = self._kernels, self.matrix
         self.device.launch(k.clear, m.count, [self._w])
         if self.affine is not None:
             self.affine.expand(p)
         for c in couplings:
             c.apply(p, self._w)
-        rows = [m.offsets, m.columns, m.values, m.held]
+        rows = [m.offsets, m.columns, m.values, m.held, *assembled]
         self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
 
     def _move_rigidly(self, p: wp.array) -> None:
@@ -186,6 +198,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = shared.functions(real)
     vec6 = wp.types.vector(6, wp.float64)
+    Rows, contact = row_kernels(real).Rows, row_kernels(real).product
 
     @wp.func
     def product(
@@ -234,6 +247,8 @@ def kernels(real: Real) -> SimpleNamespace:
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=mat33),
         held: wp.array(dtype=scalar),
+        rows_a: Rows,
+        rows_b: Rows,
         free: wp.array(dtype=wp.int32),
         b: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -242,11 +257,11 @@ def kernels(real: Real) -> SimpleNamespace:
         s_out: wp.array(dtype=vec3),
         p_out: wp.array(dtype=vec3),
     ):
-        """r = b - K x; w holds the contacts' part of K x and is left zero."""
+        """r = b - K x; w holds what couplings without rows have of K x, and is left zero."""
         i = first + wp.tid()
         r_out[i] = vec3()
         if free[i] == 1:
-            r_out[i] = b[i] - product(i, offsets, columns, values, held, x) - w[i]
+            r_out[i] = b[i] - product(i, offsets, columns, values, held, x) - contact(i, rows_a, x) - contact(i, rows_b, x) - w[i]
         w[i] = vec3()
         s_out[i] = vec3()
         p_out[i] = vec3()
@@ -342,18 +357,20 @@ def kernels(real: Real) -> SimpleNamespace:
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=mat33),
         held: wp.array(dtype=scalar),
+        rows_a: Rows,
+        rows_b: Rows,
         free: wp.array(dtype=wp.int32),
         u: wp.array(dtype=vec3),
         w: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
     ):
-        """w = K u, where w holds the contacts' part already, and delta = u . w."""
+        """w = K u, where w holds the part of couplings without rows already, and delta = u . w."""
         worker = first + wp.tid()
         delta = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             total = vec3()
             if free[i] == 1:
-                total = product(i, offsets, columns, values, held, u) + w[i]
+                total = product(i, offsets, columns, values, held, u) + contact(i, rows_a, u) + contact(i, rows_b, u) + w[i]
             w[i] = total
             delta += wp.dot(u[i], total)
         f.store_sum(delta, worker, partial_out)

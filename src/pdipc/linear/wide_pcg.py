@@ -25,6 +25,7 @@ from pdipc.linear import kernels as shared
 from pdipc.linear import rigid_modes
 from pdipc.linear.block_pcg import BlockPcg, Coupling
 from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.contact_rows import nothing
 from pdipc.linear.wide_modes import WideModes
 from pdipc.linear.wide_modes import functions as mode_functions
 
@@ -98,7 +99,7 @@ class WidePcg(BlockPcg):
         numbers = [self._gamma, modes.chunks, self._numbers, self.real.scalar(tolerated)]
 
         def begin(again: int) -> None:
-            self._find_residual(p, b, couplings)
+            self._find_residual(p, b, couplings, [nothing(self.real)] * 2)
             modes.restrict(self._r)
             device.launch_blocks(wide.correct, modes.chunks, [self._flags, -1, *correction])
             device.launch_blocks(k.begin, 1, [*numbers, again, *limits, *status, self.indefinite])
