@@ -91,6 +91,11 @@ class BlockPcg:
         self._kernels, self._pcg = kernels(real), pcg.kernels(real)
         self._advance = _advance_kernel(real)
 
+    @property
+    def direction(self) -> wp.array:
+        """(n + 1,) vec3: the last direction; where the solve ended as `indefinite`, that of negative curvature."""
+        return self._p
+
     def make_modes(self, free: np.ndarray) -> RigidModes:
         bodies = [] if self.affine is None else self.affine.bodies
         return RigidModes(self.device, self.real, self.matrix, free, bodies=bodies)

@@ -269,9 +269,11 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             going = 0
             if tells:
                 indefinite_out[0] = 1
+        bent = int(0)
         if going != 0 and not (curvature > scalar(0.0) or wp.isnan(curvature)):
-            # no step along a direction of negative curvature
+            # no step along a direction of negative curvature; but it is told
             going = 0
+            bent = 1
             if tells:
                 indefinite_out[0] = 1
                 iterations[0] = iterations[0] + 1
@@ -282,6 +284,10 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             numbers[2 * later + ALPHA] = alpha
             numbers[2 * later + GAMMA] = gamma
             going_out[0] = going
+        if bent != 0:
+            for m in range(chunk_starts[chunk] + lane, chunk_starts[chunk + 1], wp.block_dim()):
+                i = members[m]
+                p[i] = u[i] + beta * p[i]
         if going == 0:
             return
         total = vec6()

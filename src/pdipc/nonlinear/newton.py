@@ -74,6 +74,7 @@ SLACK = {
     "float64": 1.0e-12,
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
+NEAR = 10.0  # tolerances: a step that is shorter, at indefinite Hessians, is one away from a saddle
 KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
 REBOUND_TOLERANCE = {
@@ -729,6 +730,34 @@ def kernels(real: Real) -> SimpleNamespace:
         restrained_out[0] = restrained
 
     @wp.kernel(module=module)
+    def measure(
+        first: int,
+        free: wp.array(dtype=scalar),
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
+        a_out: wp.array(dtype=scalar),
+        b_out: wp.array(dtype=scalar),
+    ):
+        """How far free vertices go in a and b, m."""
+        i = first + wp.tid()
+        a_out[i] = free[i] * wp.length(a[i])
+        b_out[i] = free[i] * wp.length(b[i])
+
+    @wp.kernel(module=module)
+    def leave_saddle(
+        first: int,
+        free: wp.array(dtype=scalar),
+        lengths: wp.array(dtype=scalar),
+        limit: scalar,
+        direction: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+    ):
+        """A short step goes as far along the direction of negative curvature as it goes by itself."""
+        i = first + wp.tid()
+        if free[i] > scalar(0.0) and lengths[0] <= limit and lengths[1] > scalar(0.0):
+            p[i] = p[i] + lengths[0] / lengths[1] * direction[i]
+
+    @wp.kernel(module=module)
     def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
         i = first + wp.tid()
         if free[i] > scalar(0.0):
@@ -919,10 +948,10 @@ class Newton:
         self.starts, self.ends = upload([low for low, _ in ranges]), upload([high for _, high in ranges])
         self.whole = upload([free[low:high].all() for low, high in ranges])
         vec3, scalar = real.vec3, real.scalar
-        self.inertial, self.rhs, self.p = zeros(vec3), zeros(vec3), zeros(vec3, n + 1)
+        self.inertial, self.rhs, self.p, self.curved = zeros(vec3), zeros(vec3), zeros(vec3, n + 1), zeros(vec3, n + 1)
         self.vertex_energy = zeros(wp.float64)
         self.moved, self.forces, self.scales, self.lags = (zeros(scalar) for _ in range(4))
-        self.numbers = zeros(scalar, status.NUMBERS)
+        self.numbers, self.lengths = zeros(scalar, status.NUMBERS), zeros(scalar, 2)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after, self.slope, self.kept, self.descent = (zeros(wp.float64, self.bodies) for _ in range(5))
@@ -947,7 +976,7 @@ class Newton:
         self.nobody = zeros(wp.int32, len(work.script.movers))
         self.restraint, self.unrestrained = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest, self.largest_of_three = Largest(device, real, [n]), Largest(device, real, [n, n, n])
+        self.largest, self.largest_of_two, self.largest_of_three = (Largest(device, real, [n] * k) for k in (1, 2, 3))
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -1085,14 +1114,25 @@ class Newton:
         self.solver.solve(self.p, self.rhs, contacts, self.tolerated, self.project)
 
     def _solve_projected(self) -> None:
-        """Anew, with every element's Hessian positive semidefinite."""
-        w, k = self.work, self.kernels
-        self.device.launch_serial(k.set_flag, [self.project])
-        self.device.launch(k.restart, self.model.vertex_count, [self.model.free, self.p])
+        """Anew, with every element's Hessian positive semidefinite.
+
+        Near a saddle such steps are short and grow by little from one to the next; what led to the end of the first solve leads away from it.
+        It descends, as every direction of conjugate gradients does, and the less so the farther from the saddle: so only there is it followed.
+        """
+        w, k, device, model, n = self.work, self.kernels, self.device, self.model, self.model.vertex_count
+        device.launch_serial(k.set_flag, [self.project])
+        device.launch(k.restart, n, [model.free, self.p])
+        device.copy(self.curved, self.solver.direction)
         if self.friction is not None:
             self.friction.differentiate(w.u, self.project)
         self._assemble()
         self._solve_linear()
+        device.launch(k.measure, n, [model.free, self.p, self.curved, self.moved, self.lags])
+        self.largest_of_two.find([self.moved, self.lags], self.lengths, [0, 1])
+        limit = model.real.scalar(NEAR * model.settings.tolerance)
+        device.launch(k.leave_saddle, n, [model.free, self.lengths, limit, self.curved, self.p])
+        if self.affine is not None:
+            self.affine.expand(self.p)
 
     def correct(self, r: Restitution) -> None:
         """The velocities of restitution, `r.u_now`, by one step: the correction is small beside what bends an element."""
