@@ -202,3 +202,30 @@ def test_friction_is_bounded_by_coulombs_law(work):
     normal = np.linalg.norm(lever[rows, largest], axis=1) / np.abs(weights[rows, largest])
     assert slope.max() < 1e-9 * normal.max()  # the forces of a pair add up to nothing
     np.testing.assert_allclose(np.linalg.norm(term.force.numpy()[plain], axis=1), 0.4 * normal, rtol=1e-9)
+
+
+@pytest.mark.parametrize("projected", [1, 0])
+def test_rows_make_the_same_product(work, projected):
+    """The assembled Hessian against pair by pair; a motion of all vertices together is felt by neither."""
+    rng, x = np.random.default_rng(8), start(work)
+    barrier(work, x)
+    pairs, friction = work.method.pairs, work.method.friction
+    pairs.freeze(work.candidates, upload(x))
+    pairs.project = flag(projected)
+    pairs.differentiate(upload(x))
+    friction.lag()
+    friction.differentiate(upload(1e-4 * rng.standard_normal(x.shape)), flag(projected))
+    for term in (pairs, friction):
+        rows = term.assemble()
+        ends, lengths, columns, values = (a.numpy() for a in (rows.ends, rows.lengths, rows.columns, rows.values))
+        assert lengths.max() > 2
+        for p in (rng.standard_normal(x.shape), np.ones_like(x)):
+            product = np.zeros_like(p)
+            for i, length in enumerate(lengths):
+                low = 3 * (ends[i - 1] if i else 0)
+                own = columns[low : low + length]
+                assert len(np.unique(own)) == length
+                product[i] = np.einsum("eij,ej->i", values[low : low + length], p[own] - p[i])
+            expected = applied(term, p)
+            scale = np.abs(values).max()
+            assert np.abs(product - expected).max() < 1e-11 * scale

@@ -95,7 +95,8 @@ def test_the_solution_is_that_of_scipy(count, project):
     reference.solve(q, right, others[:count], 0.0, NO, 1e-10)
     assert np.abs(p.numpy() - q.numpy()).max() < 1e-7 * np.abs(q.numpy()).max()
     assert solver.indefinite.numpy()[0] == reference.indefinite.numpy()[0]
-    assert abs(taken - int(reference.iterations.numpy()[0])) <= 2
+    expected = int(reference.iterations.numpy()[0])
+    assert abs(taken - expected) <= max(2, 0.02 * expected)
     if project is YES:
         inside = np.repeat(free, 3)
         whole = right.numpy().ravel()[inside] - k[np.ix_(inside, ~inside)] @ start.ravel()[~inside]

@@ -266,7 +266,9 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         r_out[i] = vec3()
         if free[i] == 1:
-            r_out[i] = b[i] - product(i, offsets, columns, values, held, x) - contact(i, rows_a, x) - contact(i, rows_b, x) - w[i]
+            r_out[i] = (
+                b[i] - product(i, offsets, columns, values, held, x) - contact(i, rows_a, x) - contact(i, rows_b, x) - w[i]
+            )
         w[i] = vec3()
         s_out[i] = vec3()
         p_out[i] = vec3()

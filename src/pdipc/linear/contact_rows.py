@@ -115,4 +115,3 @@ def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> wp.K
         lengths_out[v] = length
 
     return assemble  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
-

@@ -460,7 +460,11 @@ def kernels(real: Real) -> SimpleNamespace:
                 else:
                     kept[b] = after[b]
                     trying[b] = 0
-                    if factor[b] < scalar(FARTHEST) and fell > wide(GOES_ON) * wide(factor[b]) * slope[b] and slope[b] > wide(0.0):
+                    if (
+                        factor[b] < scalar(FARTHEST)
+                        and fell > wide(GOES_ON) * wide(factor[b]) * slope[b]
+                        and slope[b] > wide(0.0)
+                    ):
                         trying[b] = 1
                         factor[b] = scalar(2.0) * factor[b]
                         again = 1
@@ -797,6 +801,7 @@ def kernels(real: Real) -> SimpleNamespace:
         script: wp.array(dtype=wp.int32),
         projected: wp.array(dtype=wp.int32),
         restrained: wp.array(dtype=wp.int32),
+        bent: wp.array(dtype=wp.int32),
         lowered: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
@@ -841,6 +846,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if projected[0] != 0:
                 left = left / scalar(EXACT)
+            # from a saddle there is farther to go than any step says, as long as the potential shows it
+            if bent[0] != 0 and lowered[0] != 0:
+                done = False
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = left <= tolerance and attempts[0] == 1
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
@@ -970,7 +978,8 @@ class Newton:
             self.driving,
             self.trials,
             self.reaching,
-        ) = (zeros(wp.int32, 1) for _ in range(11))
+            self.bent,
+        ) = (zeros(wp.int32, 1) for _ in range(12))
         self.driven = zeros(wp.int32)
         self.stretch = zeros(scalar, 1)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -1053,6 +1062,7 @@ class Newton:
     def freeze(self) -> None:
         """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
         w = self.work
+        self.device.launch(self.kernels.clear, 1, [self.bent])
         self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
             self.device.when(self._lags_now(), self.friction.lag)
@@ -1121,6 +1131,7 @@ class Newton:
         """
         w, k, device, model, n = self.work, self.kernels, self.device, self.model, self.model.vertex_count
         device.launch_serial(k.set_flag, [self.project])
+        device.launch_serial(k.set_flag, [self.bent])
         device.launch(k.restart, n, [model.free, self.p])
         device.copy(self.curved, self.solver.direction)
         if self.friction is not None:
@@ -1258,7 +1269,16 @@ class Newton:
             device.launch(k.crowd, p.capacity, inputs)
         w.script.advance(w.x_start, w.u, t.fraction)
         s = model.settings
-        states = [self.pairs.count, self.hits, self.attempts, w.script.flags, self.project, self.restrained, self.lowered]
+        states = [
+            self.pairs.count,
+            self.hits,
+            self.attempts,
+            w.script.flags,
+            self.project,
+            self.restrained,
+            self.bent,
+            self.lowered,
+        ]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
         times = [w.candidates.overflow, w.clock]
         device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])
