@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import pdipc
-from pdipc.drive import step
 
 TOLERANCE = 1e-4  # m
 

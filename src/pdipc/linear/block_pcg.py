@@ -17,9 +17,9 @@ from pdipc.linear import kernels as shared
 from pdipc.linear import pcg
 from pdipc.linear.affine import AffineBodies
 from pdipc.linear.blocks import BlockMatrix
-from pdipc.linear.rigid_modes import RigidModes
 from pdipc.linear.contact_rows import ContactRows, nothing
 from pdipc.linear.contact_rows import kernels as row_kernels
+from pdipc.linear.rigid_modes import RigidModes
 
 LOOSE = 10.0  # how much less exact a solve is that is far from the end
 
