@@ -55,11 +55,6 @@ FRICTION_LAGS = (
     12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
 )
 HALVINGS = 30  # of an island's step, then it stays where it is
-GOES_ON, GAIN, FARTHEST = (
-    0.75,
-    1.3,
-    8.0,
-)  # an island tries twice its step where the potential fell by so much of what its slope said, keeps that where it fell by so much more, up to so many steps
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
@@ -390,126 +385,6 @@ def kernels(real: Real) -> SimpleNamespace:
         searching_out[0] = searching
 
     @wp.kernel(module=module)
-    def descend(
-        first: int,
-        rhs: wp.array(dtype=vec3),
-        p: wp.array(dtype=vec3),
-        descent_out: wp.array(dtype=wide),
-    ):
-        """-grad Phi . p of each vertex, J."""
-        i = first + wp.tid()
-        total = wide(0.0)
-        for k in range(3):
-            total += wide(rhs[i][k]) * wide(p[i][k])
-        descent_out[i] = total
-
-    @wp.kernel(module=module)
-    def begin_reach(first: int, bodies: int, factor_out: wp.array(dtype=scalar), trials_out: wp.array(dtype=wp.int32)):
-        for b in range(bodies):
-            factor_out[b] = scalar(1.0)
-        trials_out[0] = 0
-
-    @wp.kernel(module=module)
-    def reach(
-        first: int,
-        bodies: int,
-        label: wp.array(dtype=wp.int32),
-        driven: wp.array(dtype=wp.int32),
-        restraint: wp.array(dtype=scalar),
-        projected: wp.array(dtype=wp.int32),
-        passes: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-        overflow: wp.array(dtype=wp.int32),
-        base_old: wp.array(dtype=wide),
-        friction_old: wp.array(dtype=wide),
-        base_new: wp.array(dtype=wide),
-        friction_new: wp.array(dtype=wide),
-        descent: wp.array(dtype=wide),
-        before: wp.array(dtype=wide),
-        after: wp.array(dtype=wide),
-        slope: wp.array(dtype=wide),
-        kept: wp.array(dtype=wide),
-        trying: wp.array(dtype=wp.int32),
-        factor: wp.array(dtype=scalar),
-        trials: wp.array(dtype=wp.int32),
-        reaching_out: wp.array(dtype=wp.int32),
-    ):
-        """Whether islands go on along their step. trials: placements that were tried. before, after, slope: (bodies,) scratch; kept: the potential at
-        `factor` of the step; trying: whether it is tried anew. Where a trial has failed, what remains is placed and proven once more.
-        """
-        again = int(0)
-        for b in range(bodies):
-            before[b] = wide(0.0)
-            after[b] = wide(0.0)
-            slope[b] = wide(0.0)
-            if trials[0] == 0:
-                trying[b] = 1
-        for b in range(bodies):
-            before[label[b]] = before[label[b]] + base_old[b] + friction_old[b]
-            after[label[b]] = after[label[b]] + base_new[b] + friction_new[b]
-            slope[label[b]] = slope[label[b]] + descent[b]
-            if driven[b] != 0 or restraint[b] > scalar(0.0):
-                trying[label[b]] = 0
-        for b in range(bodies):
-            if label[b] == b and trying[b] != 0:
-                fell = before[b] - after[b]
-                if trials[0] > 0 and (passes[0] > 0 or not (fell > wide(GAIN) * (before[b] - kept[b]))):
-                    trying[b] = 0
-                    factor[b] = scalar(0.5) * factor[b]
-                    again = 1
-                else:
-                    kept[b] = after[b]
-                    trying[b] = 0
-                    if (
-                        factor[b] < scalar(FARTHEST)
-                        and fell > wide(GOES_ON) * wide(factor[b]) * slope[b]
-                        and slope[b] > wide(0.0)
-                    ):
-                        trying[b] = 1
-                        factor[b] = scalar(2.0) * factor[b]
-                        again = 1
-        if trials[0] == 0 and (projected[0] == 0 or passes[0] > 0 or count[status.MOVING] != 0):
-            again = 0
-        if overflow[0] != 0:
-            again = 0
-        trials[0] = trials[0] + again
-        reaching_out[0] = again
-
-    @wp.kernel(module=module)
-    def go_on(
-        first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        p: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        body: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        factor: wp.array(dtype=scalar),
-        center: wp.array(dtype=wp.vec3d),
-        turn: wp.array(dtype=wp.vec3d),
-        u_tilde_out: wp.array(dtype=vec3),
-        x_tilde_out: wp.array(dtype=vec3),
-    ):
-        """x~ at `factor` of the step and of the rotation of the body."""
-        i = first + wp.tid()
-        b = body[i]
-        if b >= 0 and free[i] > scalar(0.0):
-            f = factor[label[b]]
-            step = f * p[i] + curved(widened(base[i] + u[i]) - center[b], wide(f) * turn[b])
-            u_tilde_out[i] = u[i] + step
-            x_tilde_out[i] = base[i] + u_tilde_out[i]
-
-    @wp.kernel(module=module)
-    def turn_further(
-        first: int,
-        label: wp.array(dtype=wp.int32),
-        factor: wp.array(dtype=scalar),
-        turn: wp.array(dtype=wp.vec3d),
-    ):
-        b = first + wp.tid()
-        turn[b] = wide(factor[label[b]]) * turn[b]
-
-    @wp.kernel(module=module)
     def least_fraction(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -734,7 +609,7 @@ def kernels(real: Real) -> SimpleNamespace:
         restrained_out[0] = restrained
 
     @wp.kernel(module=module)
-    def measure(
+    def compare(
         first: int,
         free: wp.array(dtype=scalar),
         a: wp.array(dtype=vec3),
@@ -962,8 +837,7 @@ class Newton:
         self.numbers, self.lengths = zeros(scalar, status.NUMBERS), zeros(scalar, 2)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
-        self.before, self.after, self.slope, self.kept, self.descent = (zeros(wp.float64, self.bodies) for _ in range(5))
-        self.factor, self.trying = zeros(scalar, self.bodies), zeros(wp.int32, self.bodies)
+        self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
         (
@@ -976,10 +850,8 @@ class Newton:
             self.restrained,
             self.lowered,
             self.driving,
-            self.trials,
-            self.reaching,
             self.bent,
-        ) = (zeros(wp.int32, 1) for _ in range(12))
+        ) = (zeros(wp.int32, 1) for _ in range(10))
         self.driven = zeros(wp.int32)
         self.stretch = zeros(scalar, 1)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -1138,7 +1010,7 @@ class Newton:
             self.friction.differentiate(w.u, self.project)
         self._assemble()
         self._solve_linear()
-        device.launch(k.measure, n, [model.free, self.p, self.curved, self.moved, self.lags])
+        device.launch(k.compare, n, [model.free, self.p, self.curved, self.moved, self.lags])
         self.largest_of_two.find([self.moved, self.lags], self.lengths, [0, 1])
         limit = model.real.scalar(NEAR * model.settings.tolerance)
         device.launch(k.leave_saddle, n, [model.free, self.lengths, limit, self.curved, self.p])
@@ -1174,42 +1046,6 @@ class Newton:
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
 
-    def _reach(self) -> None:
-        """Goes on along the step where that lowers the potential: a projected Hessian is too stiff, and most where an element would buckle."""
-        w, k, device, n, t = self.work, self.kernels, self.device, self.model.vertex_count, self.work.truncation
-        if not self.bodies:
-            return
-
-        def prepare() -> None:
-            device.launch(k.descend, n, [self.rhs, self.p, self.vertex_energy])
-            self.friction_sums.add([self.vertex_energy], self.descent)
-
-        device.when(self.project, prepare)
-        device.launch_serial(k.begin_reach, [self.bodies, self.factor, self.trials])
-        states = [self.project, t.passes, w.count, w.candidates.overflow]
-        energies = [self.base_old, self.friction_old, self.base_new, self.friction_new, self.descent]
-        judged = [self.before, self.after, self.slope, self.kept, self.trying, self.factor, self.trials, self.reaching]
-        reach = [self.bodies, self.islands.label, self.islands.driven, self.restraint, *states, *energies, *judged]
-        device.launch_serial(k.reach, reach)
-
-        def go_on() -> None:
-            which = [self.model.free, self.islands.body, self.islands.label, self.factor, self.center, self.turn]
-            device.launch(k.go_on, n, [w.x_start, w.u, self.p, *which, w.u_tilde, w.x_tilde])
-            w.candidates.check(w.x, w.x_tilde)
-            device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, w.x_tilde))
-            t.truncate(w.candidates, w.x_start, w.u, w.u_tilde, w.x)
-            self._evaluate(t.u_end, t.x_end)
-            device.launch_serial(k.reach, reach)
-
-        device.loop(self.reaching, go_on)
-
-        def settle() -> None:
-            device.launch(k.turn_further, self.bodies, [self.islands.label, self.factor, self.turn])
-            device.copy(self.hits, t.passes)
-            self.islands.renew(w.candidates)
-
-        device.when(self.trials, settle)
-
     def accept(self) -> None:
         """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
         w, k, device, n, model, t = (
@@ -1228,7 +1064,6 @@ class Newton:
         if not self.descends and self.bodies:
             device.launch(k.exempt, self.bodies, [self.islands.driven])
         self._evaluate(t.u_end, t.x_end)
-        self._reach()
         energies = [
             self.base_old,
             self.friction_old,
