@@ -667,6 +667,7 @@ def kernels(real: Real) -> SimpleNamespace:
         attempts_out[0] = 0
         count_out[status.MOVING] = 0
 
+    # Long: one decision, of all that was found out in an iteration.
     @wp.kernel(module=module)
     def decide(
         first: int,
