@@ -16,7 +16,7 @@ def test_the_command_on_the_cpu(tmp_path):
     carried = ["--case", "box_stack float64", "--small"]
     done = subprocess.run([*COMMAND, "--prepare", tmp_path, *carried], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    parts = ["scenes", "kernels", "ccd", "solvers", "worlds", "peer scenes", "ccd times", "sweeps"]
+    parts = ["scenes", "kernels", "ccd", "solvers", "worlds", "peer scenes"]
     command = [*COMMAND, "--device", "cpu", "--small", "--jobs", "1", "-o", tmp_path, "--carried", tmp_path, "--only", *parts]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -28,8 +28,6 @@ def test_the_command_on_the_cpu(tmp_path):
     assert len(checks) > 60
     assert all(check["passed"] and check["found"] <= check["limit"] for check in checks)
     assert set(parts) == {line["part"] for line in results if "ended" in line}
-    variants = {line["variant"] for line in results if "variant" in line}
-    assert variants >= {"order 1 (Jacobi)", "order 2", "order 3"}
     assert next(line for line in results if line["case"] == "s2_2" and "steps" in line)["steps"] > 0
 
 
