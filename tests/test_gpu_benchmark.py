@@ -16,7 +16,7 @@ def test_the_command_on_the_cpu(tmp_path):
     carried = ["--case", "box_stack float64", "--small"]
     done = subprocess.run([*COMMAND, "--prepare", tmp_path, *carried], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    parts = ["scenes", "kernels", "ccd", "solvers", "worlds", "peer scenes"]
+    parts = ["scenes", "kernels", "ccd", "worlds", "peer scenes"]
     command = [*COMMAND, "--device", "cpu", "--small", "--jobs", "1", "-o", tmp_path, "--carried", tmp_path, "--only", *parts]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -58,7 +58,7 @@ def agrees_with_ipctk(simulation) -> bool:
 
 
 @given(scenes())
-@settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 def test_nothing_intersects_at_any_outer_iteration(random_scene):
     try:
         simulation = watched(random_scene)
