@@ -54,7 +54,6 @@ from pdipc.linear.wide_pcg import WidePcg
 FRICTION_LAGS = (
     12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
 )
-RENEWALS = 4  # a step that has then settled takes the forces over once more, and goes on where that moves it, so often
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 SAMPLES = 128  # vertices of a body that tell how it rotates
@@ -647,7 +646,6 @@ def kernels(real: Real) -> SimpleNamespace:
     def start(
         first: int,
         bodies: int,
-        renewals: int,
         lagging_out: wp.array(dtype=wp.int32),
         restraint_out: wp.array(dtype=scalar),
         restrained_out: wp.array(dtype=wp.int32),
@@ -656,7 +654,6 @@ def kernels(real: Real) -> SimpleNamespace:
             restraint_out[b] = scalar(0.0)
         restrained_out[0] = 0
         lagging_out[0] = FRICTION_LAGS
-        lagging_out[1] = renewals
 
     @wp.kernel(module=module)
     def before_search(
@@ -733,11 +730,6 @@ def kernels(real: Real) -> SimpleNamespace:
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
-            # friction has had the normal forces of a while ago: would those of now move anything?
-            if settled and lagging[0] < 0 and lagging[1] > 0:
-                lagging[0] = 1
-                lagging[1] = lagging[1] - 1
-                settled = False
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind and script[AHEAD] == 0:
@@ -853,14 +845,14 @@ class Newton:
             self.attempts,
             self.searching,
             self.hits,
+            self.lagging,
             self.project,
             self.renew,
             self.restrained,
             self.lowered,
             self.driving,
             self.bent,
-        ) = (zeros(wp.int32, 1) for _ in range(9))
-        self.lagging = zeros(wp.int32, 2)
+        ) = (zeros(wp.int32, 1) for _ in range(10))
         self.driven = zeros(wp.int32)
         self.stretch = zeros(scalar, 1)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -905,8 +897,7 @@ class Newton:
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        renewals = 0 if self.friction is None else RENEWALS
-        self.device.launch_serial(self.kernels.start, [self.bodies, renewals, self.lagging, self.restraint, self.restrained])
+        self.device.launch_serial(self.kernels.start, [self.bodies, self.lagging, self.restraint, self.restrained])
         self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
