@@ -23,7 +23,7 @@ from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
 from pdipc.linear import contact_rows
-from pdipc.linear.contact_rows import ContactRows
+from pdipc.linear.contact_rows import ContactRows, first_entry
 from pdipc.linear.wide_pcg import Operator
 
 
@@ -291,13 +291,6 @@ def kernels(real: Real) -> SimpleNamespace:
         return response, across, work
 
     @wp.func
-    def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        return low
-
-    @wp.func
     def exert(
         v: int,
         ends: wp.array(dtype=wp.int32),
@@ -426,10 +419,8 @@ class BarrierTerm(ActivePairs):
 
     def assemble(self):
         """See `linear.block_pcg.Coupling`."""
-        r, inputs = self.rows, [self.operand(), self.free, self.entries]
-        assert r is not None
-        self.device.launch(assembly(self.real), len(self.ends), [*inputs, r.lengths, r.columns, r.values], grain=16)
-        return r.operand(self.real, self.ends)
+        assert self.rows is not None
+        return self.rows.assemble(assembly(self.real), self.operand(), self.free, self.ends, self.entries)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p at free vertices, pair by pair and gathered per vertex. Recordable."""

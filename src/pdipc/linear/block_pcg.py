@@ -143,8 +143,12 @@ class BlockPcg:
             numbers = [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), again]
             sums.conclude(k.begin, [*numbers, *limits, *status, self.indefinite])
 
+        def begin_again() -> None:
+            self._move_rigidly(p)
+            begin(again=1)
+
         begin(again=0)
-        self.device.when(loose, lambda: self._move_rigidly(p) or begin(again=1))
+        self.device.when(loose, begin_again)
 
         def iterate() -> None:
             if self.affine is not None:

@@ -17,18 +17,31 @@ from pdipc.device.precision import Real
 PARTNERS = 3  # of a vertex in a pair
 
 
+@wp.func
+def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
+    """Where the list of vertex v begins."""
+    low = int(0)
+    if v > 0:
+        low = ends[v - 1]
+    return low
+
+
 class ContactRows:
     """The blocks of a list of at most `capacity` pairs on n vertices. `kernels(real).Rows` is what a product works on."""
 
     def __init__(self, device: Device, real: Real, n: int, capacity: int):
         places = PARTNERS * 4 * capacity
+        self.device, self.real = device, real
         self.lengths = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.columns = wp.zeros(places, dtype=wp.int32, device=device.warp)
         self.values = wp.zeros(places, dtype=real.mat33, device=device.warp)
 
-    def operand(self, real: Real, ends: wp.array) -> Any:
-        """ends: (n,) int32, where the list of each vertex's pairs ends."""
-        rows = kernels(real).Rows()
+    def assemble(self, kernel: wp.Kernel, operand: Any, free: wp.array, ends: wp.array, entries: wp.array) -> Any:
+        """Launches the blocks, and returns what a product works on. kernel: of `assembly`, for `operand`; free: (n,) scalar, zero where nothing
+        is unknown; ends: (n,) int32, where the list of each vertex's pairs ends; entries: these lists, four times a pair plus a vertex's place in it.
+        """
+        self.device.launch(kernel, len(ends), [operand, free, entries, self.lengths, self.columns, self.values], grain=16)
+        rows = kernels(self.real).Rows()
         rows.used, rows.ends = 1, ends
         rows.lengths, rows.columns, rows.values = self.lengths, self.columns, self.values
         return rows
@@ -54,13 +67,6 @@ def kernels(real: Real) -> SimpleNamespace:
         values: wp.array(dtype=mat33)
 
     @wp.func
-    def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        return low
-
-    @wp.func
     def product(i: int, rows: Rows, p: wp.array(dtype=vec3)) -> vec3:
         """Row i of (contact Hessian) p."""
         total = vec3()
@@ -71,7 +77,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += rows.values[e] * (p[rows.columns[e]] - own)
         return total
 
-    return SimpleNamespace(Rows=Rows, first_entry=first_entry, product=product)
+    return SimpleNamespace(Rows=Rows, product=product)
 
 
 def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> wp.Kernel:
@@ -79,7 +85,6 @@ def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> wp.K
     has `quads`, and `ends` as above.
     """
     scalar, mat33 = real.scalar, real.mat33
-    first_entry = kernels(real).first_entry
 
     @wp.kernel(module=module)
     def assemble(

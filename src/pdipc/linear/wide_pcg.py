@@ -104,8 +104,12 @@ class WidePcg(BlockPcg):
             device.launch_blocks(wide.correct, modes.chunks, [self._flags, -1, *correction])
             device.launch_blocks(k.begin, 1, [*numbers, again, *limits, *status, self.indefinite])
 
+        def begin_again() -> None:
+            self._move_rigidly(p)
+            begin(again=1)
+
         begin(again=0)
-        device.when(loose, lambda: self._move_rigidly(p) or begin(again=1))
+        device.when(loose, begin_again)
         device.launch(wide.begin, 1, [self._going, self._left, self._flags])
 
         operands = [o for c in couplings if (o := c.operand()) is not None]

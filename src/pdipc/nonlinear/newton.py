@@ -228,10 +228,11 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
+        stretch: wp.array(dtype=scalar),
         center_out: wp.array(dtype=wp.vec3d),
         turn_out: wp.array(dtype=wp.vec3d),
     ):
-        """By how much the step p rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held."""
+        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
@@ -273,6 +274,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if number > 0:
             # a little more than the inertia, for bodies on a line
             turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * momentum
+            turn = wide(stretch[0]) * turn
             if not (wp.length(turn) < wide(MOST_TURN)):
                 turn = wp.vec3d()
         if lane == 0:
@@ -677,7 +679,6 @@ def kernels(real: Real) -> SimpleNamespace:
         script: wp.array(dtype=wp.int32),
         projected: wp.array(dtype=wp.int32),
         restrained: wp.array(dtype=wp.int32),
-        bent: wp.array(dtype=wp.int32),
         lowered: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
@@ -722,9 +723,6 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.STALLED] = count[status.STALLED] + 1
             if projected[0] != 0:
                 left = left / scalar(EXACT)
-            # from a saddle there is farther to go than any step says, as long as the potential shows it
-            if bent[0] != 0 and lowered[0] != 0:
-                done = False
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = left <= tolerance and attempts[0] == 1
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
@@ -851,8 +849,7 @@ class Newton:
             self.restrained,
             self.lowered,
             self.driving,
-            self.bent,
-        ) = (zeros(wp.int32, 1) for _ in range(10))
+        ) = (zeros(wp.int32, 1) for _ in range(9))
         self.driven = zeros(wp.int32)
         self.stretch = zeros(scalar, 1)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -935,7 +932,6 @@ class Newton:
     def freeze(self) -> None:
         """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
         w = self.work
-        self.device.launch(self.kernels.clear, 1, [self.bent])
         self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
             self.device.when(self._lags_now(), self.friction.lag)
@@ -975,14 +971,15 @@ class Newton:
         device.when(self.renew, self._assemble)
         self._solve_linear()
         device.when(self.solver.indefinite, self._solve_projected)
-        if self.bodies:
-            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p, self.center, self.turn]
-            device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         device.launch(k.measure, n, [self.p, model.free, self.rhs, self.inertial, self.moved, self.forces, self.scales])
         wanted = [self.moved, self.forces, self.scales]
         self.largest_of_three.find(wanted, self.numbers, [status.MOVED, status.FORCE, status.FORCE_SCALE])
         states = [self.project, self.hits, self.attempts, w.count]
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
+        if self.bodies:
+            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p]
+            inputs += [self.stretch, self.center, self.turn]
+            device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn]
         inputs += [w.script.target, w.script.mover, w.script.drive, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
@@ -1004,7 +1001,6 @@ class Newton:
         """
         w, k, device, model, n = self.work, self.kernels, self.device, self.model, self.model.vertex_count
         device.launch_serial(k.set_flag, [self.project])
-        device.launch_serial(k.set_flag, [self.bent])
         device.launch(k.restart, n, [model.free, self.p])
         device.copy(self.curved, self.solver.direction)
         if self.friction is not None:
@@ -1112,7 +1108,6 @@ class Newton:
             w.script.flags,
             self.project,
             self.restrained,
-            self.bent,
             self.lowered,
         ]
         limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
