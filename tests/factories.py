@@ -10,10 +10,21 @@ from pdipc.device import launch as parallel
 from pdipc.device import sums
 from pdipc.integration import inertia, script
 from pdipc.integration import loads as forces
-from pdipc.linear import affine, block_pcg, blocks, coarse, kernels, pcg, rigid_modes, translations, wide_modes, wide_pcg
+from pdipc.linear import (
+    affine,
+    block_pcg,
+    blocks,
+    coarse,
+    kernels,
+    pcg,
+    rigid_modes,
+    translations,
+    wide_modes,
+    wide_pcg,
+)
 from pdipc.linear.paper import a_jacobi as aggregated
 from pdipc.linear.paper import gauss_seidel, jacobi, powers
-from pdipc.nonlinear import anderson, local_global, newton
+from pdipc.nonlinear import anderson, descent, local_global, newton
 from pdipc.paper_mode import energy_rate, printed
 from pdipc.paper_mode import targets as paper
 
@@ -21,10 +32,12 @@ STEP = {
     "step": inertia.kernels,
     "script": script.kernels,
     "newton": newton.kernels,
+    "descent": descent.kernels,
     "body sums": lambda _: sums.kernels(),
     "local-global": local_global.kernels,
     "printed": printed.kernels,
     "exact barrier": exact.kernels,
+    "contact rows": lambda precision: {"a": exact.assembly(precision), "b": friction.assembly(precision)},
     "barrier coupling": lambda precision: {"couple": exact.coupling(precision)},
     "friction": friction.kernels,
     "friction coupling": lambda precision: {"couple": friction.coupling(precision)},

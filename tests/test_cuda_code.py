@@ -20,7 +20,7 @@ from pdipc.device.precision import real
 ARCHITECTURES = (75, 86, 90, 100)
 
 
-OWN_CODE = {"newton", "rigid modes", "wide modes", "wide couplings", "wide pcg", "reductions", "time of impact"}
+OWN_CODE = {"newton", "descent", "rigid modes", "wide modes", "wide couplings", "wide pcg", "reductions", "time of impact"}
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

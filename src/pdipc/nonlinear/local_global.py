@@ -12,7 +12,7 @@ from pdipc.device.precision import Real
 from pdipc.integration import status
 from pdipc.linear import Translations
 from pdipc.nonlinear.anderson import Anderson
-from pdipc.nonlinear.newton import Newton
+from pdipc.nonlinear.descent import Descent
 
 INNER_FRACTION = 0.1  # the inner loop ends early once it moves by less than this fraction of the tolerance
 REBOUND_ITERATIONS, REBOUND_TOLERANCE = 200, 1e-5  # of the iterations for restitution: most, and relative motion
@@ -217,8 +217,11 @@ class LocalGlobal(Iterations):
 
     def _make(self) -> None:
         super()._make()
-        self.descent = Newton(self.work)
-        self.descent.descends = not self.model.has_friction
+        self.descent = Descent(self.work, frictional=False, descends=not self.model.has_friction)
+        matrix = self.model.solver.system.matrix
+        self.work.truncation.neighbours = [
+            wp.array(part, dtype=wp.int32, device=self.device.warp) for part in (matrix.indptr, matrix.indices)
+        ]
         self.numbers = self.descent.numbers
 
     @property
@@ -234,12 +237,6 @@ class LocalGlobal(Iterations):
         """The predictor, and the potential where the step starts."""
         super().start()
         self.descent.start()
-
-    def freeze(self) -> None:
-        """Line 5."""
-        super().freeze()
-        self.descent.freeze()
-        self.device.launch(self.descent.kernels.clear, 1, [self.descent.project])
 
     def solve(self) -> None:
         """Lines 6 to 12."""

@@ -1,0 +1,664 @@
+"""As much of a motion as lowers the true potential, island by island, and whether the step has ended (line 16 of Algorithm 1).
+
+The potential of a step is that of Section 3, with the barrier and lagged friction,
+
+    Phi(x) = E + Psi + B + D,     E = sum m |u - z|^2 / (2 h^2) + damping,
+
+over the displacements u since the start of the step. After truncation Phi is compared, island by island. Where it rose, the island goes back
+along the same direction: first all of it to the least fraction that truncation left to one of its vertices, then by halves. What CCD has not
+proven is proven anew. So every outer iteration descends, unless a script moves something that the island may touch: then the potential itself
+has changed.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from pdipc.barrier.exact import BarrierTerm
+from pdipc.barrier.friction import FrictionTerm
+from pdipc.collision.islands import Islands
+from pdipc.device import blocks
+from pdipc.device.launch import Largest
+from pdipc.device.precision import Real
+from pdipc.device.sums import BodySums
+from pdipc.integration import status
+from pdipc.integration.script import AHEAD, ARRIVED, WILL
+
+FRICTION_LAGS = (
+    12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
+)
+HALVINGS = 30  # of an island's step, then it stays where it is
+SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
+RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
+RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below that
+LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
+STALLS = 3  # outer iterations without any progress of some island, then the step ends
+SLACK = {
+    "float32": 4.0e-7,
+    "float64": 1.0e-12,
+}  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
+EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
+PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
+
+
+@wp.func
+def widened(a: Any) -> wp.vec3d:
+    return wp.vec3d(wp.float64(a[0]), wp.float64(a[1]), wp.float64(a[2]))
+
+
+@wp.func
+def squared(a: Any, b: Any) -> wp.float64:
+    """|a - b|^2."""
+    total = wp.float64(0.0)
+    for k in range(3):
+        d = wp.float64(a[k]) - wp.float64(b[k])
+        total += d * d
+    return total
+
+
+@wp.func
+def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
+    """What rotating by `turn`, rad, does beyond turn x arm."""
+    angle = wp.length(turn)
+    result = wp.vec3d()
+    if angle > wp.float64(0.0):
+        along = wp.cross(turn, arm)
+        half = wp.sin(wp.float64(0.5) * angle) / angle
+        # sin(a) / a - 1 without cancellation
+        less = -angle * angle / wp.float64(6.0) * (wp.float64(1.0) - angle * angle / wp.float64(20.0))
+        if angle > wp.float64(0.05):
+            less = wp.sin(angle) / angle - wp.float64(1.0)
+        result = less * along + wp.float64(2.0) * half * half * wp.cross(turn, along)
+    return result
+
+
+@functools.cache
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    module = real.module(__name__)
+    wide = wp.float64
+    slack = wp.constant(wp.float64(SLACK[real.name]))
+    least_number = blocks.least(scalar)
+
+    @wp.kernel(module=module)
+    def inertia(
+        first: int,
+        u: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec3),
+        mass: wp.array(dtype=scalar),
+        free: wp.array(dtype=scalar),
+        h: scalar,
+        damping: scalar,
+        beside: wp.array(dtype=wide),
+        force_out: wp.array(dtype=vec3),
+        energy_out: wp.array(dtype=wide),
+    ):
+        """-dE/du of each vertex (line 8), with mass-proportional damping, and E with what is beside it."""
+        i = first + wp.tid()
+        scale = free[i] * mass[i] / h
+        force_out[i] = scale / h * (z[i] - u[i]) - scale * damping * (u[i] - rest[i])
+        energy = wide(scale) / wide(h) * squared(u[i], z[i]) + wide(scale) * wide(damping) * squared(u[i], rest[i])
+        energy_out[i] = wide(0.5) * energy + beside[i]
+
+    @wp.kernel(module=module)
+    def judge(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        driven: wp.array(dtype=wp.int32),
+        deep: wp.array(dtype=wp.int32),
+        base_old: wp.array(dtype=wide),
+        friction_old: wp.array(dtype=wide),
+        base_new: wp.array(dtype=wide),
+        friction_new: wp.array(dtype=wide),
+        overflow: wp.array(dtype=wp.int32),
+        negligible: wide,
+        before: wp.array(dtype=wide),
+        after: wp.array(dtype=wide),
+        squeezed: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        accepted_out: wp.array(dtype=wp.int32),
+        lowered_out: wp.array(dtype=wp.int32),
+        searching_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether the potential of each island has not risen; lowered: whether that of any has fallen by more than rounding. before, after,
+        squeezed: (bodies,) scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
+        for b in range(bodies):
+            before[b] = wide(0.0)
+            after[b] = wide(0.0)
+            accepted_out[b] = 0
+            squeezed[b] = 0
+        for b in range(bodies):
+            if deep[b] != 0:
+                squeezed[label[b]] = 1
+            before[label[b]] = before[label[b]] + base_old[b] + friction_old[b]
+            after[label[b]] = after[label[b]] + base_new[b] + friction_new[b]
+            if driven[b] != 0:
+                accepted_out[label[b]] = 1
+        searching = int(0)
+        lowered_out[0] = 0
+        for b in range(bodies):
+            island = label[b]
+            ok = accepted_out[island]
+            unseen = slack * wp.abs(before[island]) + negligible
+            if after[island] <= before[island] + unseen or attempts[0] > HALVINGS:
+                ok = 1
+            if after[island] < before[island] - unseen:
+                lowered_out[0] = 1
+            if squeezed[island] != 0 and attempts[0] == 0:
+                ok = 0
+            accepted_out[b] = ok
+            if ok == 0:
+                searching = 1
+        attempts[0] = attempts[0] + 1
+        if overflow[0] != 0:
+            searching = 0
+        searching_out[0] = searching
+
+    @wp.kernel(module=module)
+    def least_fraction(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        free: wp.array(dtype=scalar),
+        attempts: wp.array(dtype=wp.int32),
+        first_fraction: wp.array(dtype=scalar),
+        fraction: wp.array(dtype=scalar),
+        least_out: wp.array(dtype=scalar),
+    ):
+        """What the first pass of truncation left to every vertex of a body, or later what it makes now: CCD may have cut some anew, and only
+        where all make the same part of the step it is the step, which descends.
+        """
+        worker = first + wp.tid()
+        b = worker // wp.block_dim()
+        least = scalar(1.0)
+        for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
+            if free[i] > scalar(0.0):
+                part = fraction[i]
+                if attempts[0] == 1:
+                    part = first_fraction[i]
+                least = wp.min(least, part)
+        least = least_number(least)
+        if worker % wp.block_dim() == 0:
+            least_out[b] = least
+
+    @wp.kernel(module=module)
+    def spread_least(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        island_least_out: wp.array(dtype=scalar),
+    ):
+        for b in range(bodies):
+            island_least_out[b] = scalar(1.0)
+        for b in range(bodies):
+            island_least_out[label[b]] = wp.min(island_least_out[label[b]], least[b])
+
+    @wp.kernel(module=module)
+    def turn_back(
+        first: int,
+        body: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        u_tilde: wp.array(dtype=vec3),
+        center: wp.array(dtype=wp.vec3d),
+        turn: wp.array(dtype=wp.vec3d),
+        fraction: wp.array(dtype=scalar),
+        u_end_out: wp.array(dtype=vec3),
+        x_end_out: wp.array(dtype=vec3),
+        passes_out: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """A part of the step, and of the rotation of the body: where on the arc, not on its chord."""
+        i = first + wp.tid()
+        if i == 0:
+            passes_out[0] = 1  # what is not shortened has been proven already
+            going_out[0] = 1
+        b = body[i]
+        if b >= 0 and accepted[wp.max(b, 0)] == 0:
+            f = least[label[b]]
+            if attempts[0] > 1 or f >= scalar(1.0):
+                f = scalar(0.5) * f
+            if attempts[0] >= HALVINGS:
+                f = scalar(0.0)
+            fraction[i] = f
+            arm = widened(base[i] + u[i]) - center[b]
+            arc = vec3(curved(arm, wide(f) * turn[b])) - f * vec3(curved(arm, turn[b]))
+            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i]) + arc
+            x_end_out[i] = base[i] + u_end_out[i]
+
+    @wp.kernel(module=module)
+    def commit(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        base: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        u_end: wp.array(dtype=vec3),
+        x_end: wp.array(dtype=vec3),
+        u_out: wp.array(dtype=vec3),
+        x_out: wp.array(dtype=vec3),
+        lag_out: wp.array(dtype=scalar),
+    ):
+        """The motion is made. lag: how far a scripted vertex is from its goal, m."""
+        i = first + wp.tid()
+        lag_out[i] = scalar(0.0)
+        if overflow[0] == 0:
+            u_out[i] = u_end[i]
+            x_out[i] = x_end[i]
+            if free[i] == scalar(0.0):
+                lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
+
+    @wp.kernel(module=module)
+    def commit_energies(
+        first: int,
+        base_new: wp.array(dtype=wide),
+        base_old_out: wp.array(dtype=wide),
+    ):
+        b = first + wp.tid()
+        base_old_out[b] = base_new[b]
+
+    @wp.kernel(module=module)
+    def crowd(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        quads: wp.array(dtype=wp.vec4i),
+        free: wp.array(dtype=scalar),
+        gaps: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        mover: wp.array(dtype=wp.int32),
+        body: wp.array(dtype=wp.int32),
+        label: wp.array(dtype=wp.int32),
+        squeezed: wp.array(dtype=wp.int32),
+        restraint: wp.array(dtype=scalar),
+        crowded_out: wp.array(dtype=wp.int32),
+    ):
+        """Which movers have a pair that is squeezed, or whose body is held back or was just stopped by one, and that what is left of their
+        way would close; whoever writes, writes the same.
+        """
+        k = first + wp.tid()
+        waits = False
+        if k < pairs[0]:
+            waits = gaps[k] < scalar(SQUEEZED) * activation[k]
+            for s in range(4):
+                b = body[quads[k][s]]
+                if b >= 0:
+                    waits = waits or restraint[b] > scalar(0.0) or squeezed[label[b]] != 0
+        if waits:
+            closing = scalar(0.0)
+            for s in range(4):
+                i = quads[k][s]
+                if free[i] == scalar(0.0):
+                    closing += weights[k][s] * wp.dot(normals[k], (target[i] - base[i]) - u[i])
+            for s in range(4):
+                i = quads[k][s]
+                if free[i] == scalar(0.0) and closing < scalar(0.0):
+                    crowded_out[mover[i]] = 1
+
+    @wp.kernel(module=module)
+    def clear(first: int, flags_out: wp.array(dtype=wp.int32)):
+        flags_out[first + wp.tid()] = 0
+
+    @wp.kernel(module=module)
+    def exempt(first: int, flags_out: wp.array(dtype=wp.int32)):
+        flags_out[first + wp.tid()] = 1
+
+    @wp.kernel(module=module)
+    def start(
+        first: int,
+        bodies: int,
+        lagging_out: wp.array(dtype=wp.int32),
+        restraint_out: wp.array(dtype=scalar),
+        restrained_out: wp.array(dtype=wp.int32),
+    ):
+        for b in range(bodies):
+            restraint_out[b] = scalar(0.0)
+        restrained_out[0] = 0
+        lagging_out[0] = FRICTION_LAGS
+
+    @wp.kernel(module=module)
+    def before_search(
+        first: int,
+        passes: wp.array(dtype=wp.int32),
+        hits_out: wp.array(dtype=wp.int32),
+        attempts_out: wp.array(dtype=wp.int32),
+        count_out: wp.array(dtype=wp.int32),
+    ):
+        hits_out[0] = passes[0]
+        attempts_out[0] = 0
+        count_out[status.MOVING] = 0
+
+    # Long: one decision, of all that was found out in an iteration.
+    @wp.kernel(module=module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        script: wp.array(dtype=wp.int32),
+        projected: wp.array(dtype=wp.int32),
+        restrained: wp.array(dtype=wp.int32),
+        lowered: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        clock: wp.array(dtype=wide),
+        tolerance: scalar,
+        max_outer: int,
+        budget_ms: wide,
+        numbers: wp.array(dtype=scalar),
+        lagging: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        going_out: wp.array(dtype=wp.int32),
+    ):
+        """Line 16. script: its flags. numbers: the largest wanted motion and lag, m.
+
+        Whatever is limited begins anew where something scripted came to a waypoint: what follows is another problem.
+        """
+        code = int(status.RUNNING)
+        residual = numbers[status.MOVED]
+        behind = numbers[status.LAG] > scalar(0.0)
+        # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes.
+        # One motion alone says nothing: the first step out of a stiff barrier is short, however far the way is that it opens
+        ratio = scalar(0.99)
+        if count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        numbers[status.MOVED_BEFORE] = residual
+        if overflow[0] != 0:
+            code = status.OVERFLOW
+        else:
+            count[status.OUTER] = count[status.OUTER] + 1
+            count[status.SINCE] = count[status.SINCE] + 1
+            count[status.BARRIERS] = pairs[0]
+            lagging[0] = lagging[0] - 1
+            if script[ARRIVED] != 0:
+                count[status.SINCE] = 0
+                count[status.STALLED] = 0
+                lagging[0] = FRICTION_LAGS
+            if hits[0] > 0:
+                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
+            if attempts[0] > 1:
+                count[status.SEARCHES] = count[status.SEARCHES] + 1
+            if attempts[0] > HALVINGS:
+                count[status.STALLED] = count[status.STALLED] + 1
+            if projected[0] != 0:
+                left = left / scalar(EXACT)
+            # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
+            done = left <= tolerance and attempts[0] == 1
+            if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
+                done = True
+            settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
+            if residual >= scalar(wp.inf):
+                code = status.NOT_FINITE
+            elif settled and not behind and script[AHEAD] == 0:
+                code = status.CONVERGED
+            elif settled and script[WILL] == 0:
+                code = status.LAGGING
+            elif count[status.STALLED] >= STALLS:
+                code = status.STALLING
+            elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+                code = status.OUT_OF_TIME
+            elif count[status.SINCE] >= max_outer:
+                code = status.CAPPED
+        # what is held back wants less than it would: a step that ends so tells of the last motion that was wanted freely
+        if restrained[0] == 0:
+            numbers[status.MOVED_FREELY] = residual
+        elif code != status.RUNNING:
+            numbers[status.MOVED] = wp.max(residual, numbers[status.MOVED_FREELY])
+        count[status.STATUS] = code
+        going_out[0] = 0
+        if code == status.RUNNING:
+            going_out[0] = 1
+
+    @wp.kernel(module=module)
+    def note_motion(
+        first: int,
+        free: wp.array(dtype=scalar),
+        p: wp.array(dtype=vec3),
+        count: wp.array(dtype=wp.int32),
+    ):
+        """Whether anything scripted moves in this iteration; whoever writes, writes the same."""
+        i = first + wp.tid()
+        if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
+            count[status.MOVING] = 1
+
+    @wp.kernel(module=module)
+    def restrain(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        driven: wp.array(dtype=wp.int32),
+        squeezed: wp.array(dtype=wp.int32),
+        attempts: wp.array(dtype=wp.int32),
+        least: wp.array(dtype=scalar),
+        restraint: wp.array(dtype=scalar),
+        restrained_out: wp.array(dtype=wp.int32),
+    ):
+        """By how many times its inertia each body is held back, as in the method of Levenberg and Marquardt.
+
+        Newton's step doubles a tiny gap, if it is made whole. But what slides past such a gap hits it at once, and an island that is shortened by
+        that makes no way, and squeezes the gap further. Inertia shortens the sliding and leaves the opening, which is stiff, as it is.
+        """
+        restrained = int(0)
+        for b in range(bodies):
+            island = label[b]
+            r = scalar(RELEASE) * restraint[b]
+            if r < scalar(RELEASED):
+                r = scalar(0.0)
+            if squeezed[island] != 0 and attempts[0] > 1 and least[island] < scalar(RESTRAIN) and driven[b] == 0:
+                r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
+                r = wp.min(r, scalar(MOST_RESTRAINT))
+            restraint[b] = r
+            if r > scalar(0.0):
+                restrained = 1
+        restrained_out[0] = restrained
+
+    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+
+
+def islands_of(model, owner: np.ndarray) -> Islands:
+    """Which bodies may push on each other. owner: (n,), the simulated body of each vertex, -1 for obstacles."""
+    assembly, simulated = model.assembly, owner >= 0
+    ties = np.concatenate(
+        [np.zeros((0, 2), dtype=np.int32)]
+        + [np.column_stack([a.vertices_a, a.vertices_b]) for a in assembly.attachments]
+        + [s.elements[:, [0, corner]] for s in (*assembly.stitches, *assembly.pins) for corner in (1, 2, 3)]
+    )
+    both = simulated[ties].all(axis=1)
+    joined = np.unique(owner[ties[both]], axis=0)
+    held = np.flatnonzero(simulated & ~model.free_vertices)
+    to_obstacles = np.concatenate([ties[~both], ties[~both][:, ::-1]])
+    to_obstacles = to_obstacles[~simulated[to_obstacles[:, 0]] & simulated[to_obstacles[:, 1]]]
+    scripted, moved = np.concatenate([held, to_obstacles[:, 0]]), np.concatenate([held, to_obstacles[:, 1]])
+    ranges = [(body.first, body.last) for body in assembly.bodies if not body.kinematic]
+    return Islands(model.device, model.real, len(owner), ranges, joined, np.column_stack([scripted, owner[moved]]))
+
+
+class Descent:
+    """What the methods of the default mode share: the potential, the line search and the end of a step.
+
+    p: (n + 1,) vec3, m, the motion that an iteration wants. numbers: on the device, see `status`: the largest such motion, m; forces, N; lag, m.
+    descends: whether a motion has to lower the potential. frictional: whether friction is part of it.
+    """
+
+    # Long: all that lives as long as the solve is made here.
+    def __init__(self, work, frictional: bool = True, descends: bool = True):
+        model = work.model
+        device, real, n = model.device, model.real, model.vertex_count
+        self.work, self.model, self.device, self.descending = work, model, device, kernels(real)
+        self.descends = descends
+        assembly, settings, free = model.assembly, model.settings, model.free_vertices
+        self.pairs = BarrierTerm(device, real, model.kappa, model.friction, model.free, settings.slip_threshold)
+        self.friction = FrictionTerm(self.pairs, settings.slip_threshold) if model.has_friction and frictional else None
+        simulated = [body for body in assembly.bodies if not body.kinematic]
+        owner = np.where(assembly.body_of_vertex < len(simulated), assembly.body_of_vertex, -1)
+        self.bodies = len(simulated)
+        self.islands = islands_of(model, owner)
+        work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
+        work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
+        of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
+        elements = np.concatenate([*of_elements, np.zeros(0, dtype=owner.dtype)])
+        self.base_sums = BodySums(device, [elements, owner], self.bodies)
+        self.friction_sums = BodySums(device, [owner], self.bodies)
+
+        def zeros(dtype, count=n):
+            return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
+
+        # a body that follows four points turns as these do
+        self.ranges = [(body.handles[0] if len(body.handles) else body.first, body.last) for body in simulated]
+        of_bodies = np.array([*self.ranges, (0, 0)], dtype=np.int32)
+        self.starts, self.ends = (wp.array(side, device=device.warp) for side in of_bodies.T.copy())
+        vec3, scalar = real.vec3, real.scalar
+        self.inertial, self.p = zeros(vec3), zeros(vec3, n + 1)
+        self.vertex_energy = zeros(wp.float64)
+        self.lags, self.numbers = zeros(scalar), zeros(scalar, status.NUMBERS)
+        self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
+        self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
+        self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
+        self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
+        self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
+        flags = (zeros(wp.int32, 1) for _ in range(7))
+        self.attempts, self.searching, self.hits, self.lagging, self.project, self.restrained, self.lowered = flags
+        self.restraint = zeros(scalar, self.bodies)
+        self.pairs.project = self.project
+        self.largest = Largest(device, real, [n])
+        mass = model.mass.numpy()
+        lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
+        self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
+
+    @property
+    def generation(self) -> int:
+        """Grows whenever arrays were replaced."""
+        return self.pairs.generation
+
+    def grow(self) -> bool:
+        """Makes room where a list was full."""
+        grown = self.pairs.grow()
+        if grown and self.friction is not None:
+            self.friction.grow()
+        return grown
+
+    def start(self) -> None:
+        """Before the first outer iteration: the potential where the step starts."""
+        w = self.work
+        self.device.launch_serial(self.descending.start, [self.bodies, self.lagging, self.restraint, self.restrained])
+        self.islands.find(w.candidates)
+        if self.friction is not None:
+            self.pairs.freeze(w.candidates, w.x)
+            self.friction.lag()
+        self._evaluate(w.u, w.x)
+        self._keep_energies()
+
+    def _evaluate(self, u: wp.array, x: wp.array) -> None:
+        """The potential and the forces at x; with friction as it lags."""
+        w, k, device, n = self.work, self.descending, self.device, self.model.vertex_count
+        s, real = self.model.settings, self.model.real
+        self.pairs.freeze(w.candidates, x)
+        self.pairs.differentiate(x)
+        inputs = [u, w.rest, w.z, self.model.mass, self.model.free, real.scalar(s.time_step), real.scalar(s.damping)]
+        device.launch(k.inertia, n, [*inputs, self.pairs.energy_of_vertex, self.inertial, self.vertex_energy])
+        self.model.projector.evaluate(w.x_start, u)
+        self._sum_energies()
+        if self.friction is not None:
+            self.friction.differentiate(u, self.project)
+            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_new)
+
+    def _sum_energies(self) -> None:
+        self.base_sums.add([self.model.projector.energies, self.vertex_energy], self.base_new)
+
+    def _keep_energies(self) -> None:
+        """The energies that were evaluated last, at w.u, are those that the next are compared with."""
+        if self.model.projector.cavities is not None:
+            # a gas holds far more energy than a step changes, and what is put down to rounding is a part of the energy: so it counts from here
+            self.model.projector.cavities.refer(self.work.x_start, self.work.u)
+            self.model.projector.evaluate(self.work.x_start, self.work.u)
+            self._sum_energies()
+        if self.bodies:
+            self.device.launch(self.descending.commit_energies, self.bodies, [self.base_new, self.base_old])
+
+    def accept(self) -> None:
+        """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
+        w, k, device, n, model, t = (
+            self.work,
+            self.descending,
+            self.device,
+            self.model.vertex_count,
+            self.model,
+            self.work.truncation,
+        )
+        device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts, w.count])
+        self.islands.renew(w.candidates)
+        if w.script.moves:
+            device.launch(k.note_motion, n, [model.free, self.p, w.count])
+            self.islands.find_driven(w.candidates, w.u, w.u_tilde)
+        if not self.descends and self.bodies:
+            device.launch(k.exempt, self.bodies, [self.islands.driven])
+        self._evaluate(t.u_end, t.x_end)
+        energies = [
+            self.base_old,
+            self.friction_old,
+            self.base_new,
+            self.friction_new,
+            w.candidates.overflow,
+            self.tolerated**2,
+        ]
+        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.lowered, self.searching]
+        judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
+        device.launch_serial(k.judge, judging)
+
+        def search() -> None:
+            if self.bodies:
+                inputs = [self.starts, self.ends, model.free, self.attempts, t.first_fraction, t.fraction, self.least]
+                device.launch_blocks(k.least_fraction, self.bodies, inputs, grain=1000)
+                device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
+            which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
+            motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
+            device.launch(k.turn_back, n, [*which, *motion])
+            w.candidates.check(w.x, t.x_end)
+            device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, t.x_end))
+            t.prove(w.candidates, w.x_start, w.u, w.u_tilde, w.x)
+            self._evaluate(t.u_end, t.x_end)
+            device.launch_serial(k.judge, judging)
+
+        device.loop(self.searching, search)
+        inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
+        device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
+        self.largest.find([self.lags], self.numbers, [status.LAG])
+        self._keep_energies()
+        if w.script.moves:
+            p = self.pairs
+            device.launch(k.clear, len(w.script.movers), [w.script.crowded])
+            inputs = [p.count, p.quads, model.free, p.gaps, p.activation, p.weights, p.normals]
+            inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
+            inputs += [self.squeezed, self.restraint, w.script.crowded]
+            device.launch(k.crowd, p.capacity, inputs)
+        w.script.advance(w.x_start, w.u, t.fraction)
+        s = model.settings
+        states = [
+            self.pairs.count,
+            self.hits,
+            self.attempts,
+            w.script.flags,
+            self.project,
+            self.restrained,
+            self.lowered,
+        ]
+        limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
+        times = [w.candidates.overflow, w.clock]
+        device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])
+        which = [self.islands.label, self.islands.driven, self.squeezed, self.attempts, self.island_least]
+        device.launch_serial(k.restrain, [self.bodies, *which, self.restraint, self.restrained])
