@@ -103,6 +103,7 @@ def test_dragon():
     def dragged(data):
         data["bodies"][0]["mesh"]["cells"] = 20
         data["simulation"]["damping"] = 20.0
+        data["forces"] = data["forces"][:2]
         for force in data["forces"]:
             force["end"] = 0.08
             force["force"] = tuple(0.5 * np.array(force["force"]))

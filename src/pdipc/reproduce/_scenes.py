@@ -73,31 +73,54 @@ def falling_dinosaur() -> Scene:
 
 
 def dragon() -> Scene:
-    """Held by its feet, dragged by head and tail, and let go."""
+    """Held by its feet, dragged by head and tail against rods to one side and to the other, and let go."""
     arrays = np.load(needed("meshes/imperfect/dragon_nonmanifold_44k.npz"))
-    vertices = unit(arrays["V"])
-    mesh = filled(vertices, arrays["F"], 86_000, "dragon", surface_splits=6_000)
+    mesh = filled(unit(arrays["V"]), arrays["F"], 86_000, "dragon", surface_splits=6_000)
     x = mesh["vertices"]
     bottom = float(x[:, 1].min())
+    rods = [
+        {
+            "name": name,
+            "mesh": {"shape": "cylinder", "radius": 0.02, "length": 0.9, "cells": (16, 12)},
+            "look": {"color": "#b98a5a"},
+            "translation": (at[0], bottom + 0.45, at[1]),
+        }
+        for name, at in (("left rod", (-0.22, -0.4)), ("right rod", (0.22, -0.4)), ("tail's rod", (0.16, 0.44)))
+    ]
 
-    def pulled(along: int, sign: float, force: tuple[float, float, float]) -> dict[str, Any]:
-        """A force on the part that lies furthest that way."""
-        at = np.quantile(sign * x[:, along], 0.97)
+    def pulled(sign: float, force: tuple[float, float, float], start: float, end: float) -> dict[str, Any]:
+        """A force on the end that lies that way along z, above the ground."""
+        at = np.quantile(sign * x[:, 2], 0.97)
         return {
             "kind": "vertices",
             "body": "dragon",
-            "select": {"vertices": np.flatnonzero(sign * x[:, along] > at).tolist()},
+            "select": {"vertices": np.flatnonzero((sign * x[:, 2] > at) & (x[:, 1] > bottom + 0.15)).tolist()},
             "force": force,
-            "end": 0.4,
+            "start": start,
+            "end": end,
         }
 
     return Scene(
         title="Dragon",
+        picture={"view": (1.0, 0.45, -0.5)},
         simulation={"steps": 120, "damping": 4.0},
         contact={**CONTACT, "friction": 0.2},
-        bodies=[solid("dragon", mesh, 2e5, pins=[{"select": {"vertices": np.flatnonzero(x[:, 1] < bottom + 0.03).tolist()}}])],
-        obstacles=[floor(bottom - 0.01)],
-        forces=[pulled(2, 1.0, (30.0, -60.0, -140.0)), pulled(2, -1.0, (20.0, 50.0, 60.0))],
+        bodies=[
+            solid(
+                "dragon",
+                mesh,
+                2e5,
+                look={"color": "#3f9d74"},
+                pins=[{"select": {"vertices": np.flatnonzero(x[:, 1] < bottom + 0.03).tolist()}}],
+            )
+        ],
+        obstacles=[floor(bottom - 0.01), *rods],
+        forces=[
+            pulled(-1.0, (-110.0, -30.0, -20.0), 0.0, 0.35),
+            pulled(1.0, (80.0, 30.0, 20.0), 0.0, 0.35),
+            pulled(-1.0, (110.0, -30.0, 20.0), 0.35, 0.7),
+            pulled(1.0, (-80.0, 60.0, -40.0), 0.35, 0.7),
+        ],
     )
 
 
@@ -278,7 +301,7 @@ def hung(ghost: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def animal_crossing() -> Scene:
-    """Two each of seven animals, over seven straps that lie on two rails."""
+    """The bundled scene with eleven animals of the optional data, of seven kinds, and finer straps."""
     kinds = {
         "cat_16k": 0.42,
         "koala_7k": 0.42,
@@ -293,12 +316,14 @@ def animal_crossing() -> Scene:
     meshes = {}
     for kind, size in kinds.items():
         arrays = np.load(needed(f"meshes/tri/{kind}.npz"))
-        meshes[kind] = filled(unit(arrays["V"], size), arrays["F"], 20_700, kind)
+        meshes[kind] = filled(unit(arrays["V"], size), arrays["F"], 24_700, kind)
     for number, body in enumerate(animals):
         body["mesh"] = meshes[list(kinds)[number % len(kinds)]]
     for body in small["bodies"]:
         if body["name"] == "strap":
             body["mesh"]["cells"] = (6, 1, 60)
+        if body["name"] == "cross strap":
+            body["mesh"]["cells"] = (60, 1, 6)
     small["contact"] |= CONTACT
     return Scene.model_validate(small)
 
