@@ -55,6 +55,8 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
     assert written["machine"] and len(written["rows"]) == 2
     for name in ("dragon.png", "scenes.png", "table1.png"):
         assert (tmp_path / name).stat().st_size > 20_000
+    for mode in ("default", "paper"):
+        assert (tmp_path / f"dragon-{mode}.mp4").stat().st_size > 1000
     before = open_run(tmp_path / "dragon-default").positions(-1)
 
     def not_again(*_):
@@ -65,6 +67,7 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
         patched.setattr(_common, "pictures", not_again)
         assert run(*options, "--steps", 2).exit_code == 0
     monkeypatch.setattr(table1, "_picture", lambda *_: None)
+    monkeypatch.setattr(table1, "_films", lambda *_: None)
     assert run("--rows", "dragon", "-o", tmp_path, "--steps", 3).exit_code == 0
     longer = open_run(tmp_path / "dragon-default")
     assert longer.frame_count == 4

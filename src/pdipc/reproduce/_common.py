@@ -120,13 +120,19 @@ def pictures(
     size: tuple[int, int],
     view: tuple[float, float, float] | None = None,
     framed: Iterable[int] | None = None,
+    beside: Run | None = None,
 ) -> list[np.ndarray]:
     """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`).
 
-    view: absent, that of the scene.
+    view: absent, that of the scene. beside: a run under whose camera, for the same frames, this one is drawn.
     """
     frames = list(frames)
     settings = settings_of(run).model_copy(update={"size": size} | ({"view": view} if view else {}))
+    if beside is not None:
+        with drawing(beside, list(framed or frames), settings) as drawn:
+            camera = drawn.plotter.camera
+            place = {"position": tuple(camera.position), "target": tuple(camera.focal_point)}
+        settings = settings.model_copy(update=place)
     with drawing(run, list(framed or frames), settings) as drawn:
         return [drawn.image(frame) for frame in frames]
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 from pdipc.collision.surface import unique_edges
 from pdipc.device.launch import Device
 from pdipc.output.results import Run, open_run
+from pdipc.pictures.render import render_animation, settings_of
 from pdipc.reproduce import _common, _scenes
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.load import load_scene
@@ -24,6 +26,8 @@ JUDGED = ("steps", "unconverged", "intersections", "median ms", "p95 ms", "energ
 MODES = ("default", "paper")
 Mode = Literal["default", "paper", "both"]
 SHOTS = (0.0, 0.3, 0.6, 1.0)  # of a run, in its picture
+FILM = (640, 480)  # pixels
+FRAMES = 50  # of a film, about
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ def run(
     mode: Mode = "default",
     steps: int | None = None,
 ) -> Path:
-    """Writes table1.csv, table1.json, table1.md, table1.txt, table1.png, scenes.png, and a folder and a picture a row, to `out_dir`; returns the
+    """Writes table1.csv, table1.json, table1.md, table1.txt, table1.png, scenes.png, and a folder, a picture and a film a row, to `out_dir`; returns the
     PNG. small: the bundled scenes. rows: names in ROWS, all where empty. mode: the default one, the paper's, or both. steps: in place
     of each scene's. Rows that `out_dir` holds are kept and, where more steps are asked for, go on.
 
@@ -133,6 +137,7 @@ def run(
         found += judged
         if known != judged or not (out / f"{name}.png").is_file():
             _picture(out, name, modes)
+            _films(out, name, modes)
         _write(out, found, machine, small)
     _gallery(out, chosen)
     return _conclude(out, found, machine, small)
@@ -284,15 +289,25 @@ def _picture(out: Path, name: str, modes: Sequence[str]) -> None:
     figure, axes = plt.subplots(
         len(modes), len(SHOTS), figsize=(4 * len(SHOTS), 3.1 * len(modes)), layout="constrained", squeeze=False
     )
-    for line, mode in zip(axes, modes, strict=True):
-        done = open_run(out / f"{name}-{mode}")
-        frames = [round(part * (done.frame_count - 1)) for part in SHOTS]
-        for axis, frame, image in zip(line, frames, _common.pictures(done, frames, (800, 600)), strict=True):
+    runs = [open_run(out / f"{name}-{mode}") for mode in modes]
+    last = min(done.frame_count for done in runs) - 1
+    frames = [round(part * last) for part in SHOTS]
+    for line, mode, done in zip(axes, modes, runs, strict=True):
+        images = _common.pictures(done, frames, (800, 600), beside=None if done is runs[0] else runs[0])
+        for axis, frame, image in zip(line, frames, images, strict=True):
             axis.imshow(image)
             axis.set_title(f"{mode} mode, {done.times[frame]:.2f} s", fontsize=10)
             axis.axis("off")
     figure.savefig(out / f"{name}.png", dpi=150)
     plt.close(figure)
+
+
+def _films(out: Path, name: str, modes: Sequence[str]) -> None:
+    """A film a mode, of at most so many frames."""
+    for mode in modes:
+        done = open_run(out / f"{name}-{mode}")
+        settings = settings_of(done).model_copy(update={"size": FILM, "every": math.ceil(done.frame_count / FRAMES)})
+        render_animation(done, out / f"{name}-{mode}.mp4", settings)
 
 
 def _gallery(out: Path, names: Sequence[str]) -> None:
