@@ -14,6 +14,7 @@ from pdipc.reproduce._filled import filled
 from pdipc.scene.generators import Figure
 from pdipc.scene.schema import Scene
 
+WOOD = "#b98a5a"
 CONTACT = {"activation_distance": 5e-3}  # m: Section 7, for models of 1 m
 
 
@@ -49,6 +50,7 @@ def falling_dinosaur() -> Scene:
         "rod",
         {"shape": "cylinder", "radius": 0.03, "length": 1.6, "cells": (4, 40)},
         1e8,
+        look={"color": WOOD},
         rotation=(90.0, 0.0, 0.0),
         translation=(-0.3, -0.04, 0.0),
         copies={"counts": (3, 1, 1), "spacing": (0.3, 1.0, 1.0)},
@@ -59,12 +61,14 @@ def falling_dinosaur() -> Scene:
         "dinosaur",
         {"vertices": body, "tets": arrays["T"]},
         2e5,
+        look={"color": "#6f9f5a"},
         rotation=(0.0, 0.0, 90.0),
         translation=(0.0, 0.21, 0.0),
         velocity=(0.0, -1.5, 0.0),
     )
     return Scene(
         title="Falling dinosaur",
+        picture={"view": (0.25, 0.8, 0.9)},
         simulation={"steps": 100},
         contact={**CONTACT, "friction": 0.3},
         bodies=[dinosaur, rod],
@@ -82,7 +86,7 @@ def dragon() -> Scene:
         {
             "name": name,
             "mesh": {"shape": "cylinder", "radius": 0.02, "length": 0.9, "cells": (16, 12)},
-            "look": {"color": "#b98a5a"},
+            "look": {"color": WOOD},
             "translation": (at[0], bottom + 0.45, at[1]),
         }
         for name, at in (("left rod", (-0.22, -0.4)), ("right rod", (0.22, -0.4)), ("tail's rod", (0.16, 0.44)))
@@ -150,6 +154,7 @@ def armadillo() -> Scene:
     }
     return Scene(
         title="The authors' Armadillo",
+        picture={"view": (1.0, 0.35, -0.3), "ground": float(arrays["armadillo_points"][:, 1].min())},
         simulation={"steps": 200, "gravity": (0.0, -9.8, 0.0)},
         contact={"activation_distance": 5e-3},
         bodies=[*cloths, body],
@@ -183,6 +188,7 @@ def tiered_skirt() -> Scene:
     seams = sewn(vertices, triangles, 4e-3)
     return Scene(
         title="Tiered skirt",
+        picture={"view": (0.4, 0.15, 1.0), "ground": float(body[0][:, 1].min())},
         simulation={"steps": 100},
         contact={"activation_distance": 1e-3, "friction": 0.4},
         bodies=[
@@ -196,11 +202,13 @@ def tiered_skirt() -> Scene:
                     "bending": "curved",
                     "bending_stiffness": 5e-5,
                 },
+                "look": {"color": "#c8508a"},
             }
         ],
         obstacles=[
             {
                 "name": "dancer",
+                "look": {"color": "#d8c4b2"},
                 "mesh": {"vertices": body[0], "triangles": cache["F"]},
                 "motion": {"cache": {"vertices": body, "times": (0.04 * np.arange(len(body))).tolist()}},
             }
