@@ -5,7 +5,8 @@ an outer iteration commits is judged by brute force over all pairs, in exact ari
 (tests/collision/exact.py), and every state by the witness; motions must follow one another without a break, what turns must be near its arc, and a run
 that is resumed must give the same bits. A breach is printed with the scene's family and number, from which `--family NAME --only NUMBER` makes it again.
 
-It must end with "breaches: 0". Scenes that are refused are counted, not judged. Writes benchmarks/results/attack.json.
+It must end with "breaches: 0". Scenes that are refused are counted, not judged. Writes benchmarks/results/attack.json after each number; with
+`--log FILE` each outcome is a line of FILE, and a scene of this seed that FILE holds already is not run again.
 """
 
 import argparse
@@ -452,61 +453,70 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="scenes at a time")
     parser.add_argument("--family", action="append", choices=[family.__name__ for family in FAMILIES])
     parser.add_argument("--only", type=int, help="this number of each family alone")
+    parser.add_argument("--log", type=Path, help="outcomes, a line each; what it holds is not run again")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "attack.json")
     options = parser.parse_args()
     names = [family.__name__ for family in FAMILIES if not options.family or family.__name__ in options.family]
+    if options.only is not None:
+        outcomes = [outcome_of(name, options.only, options.seed) for name in names]
+        print(*map(json.dumps, outcomes), sep="\n")
+        return int(any(map(wrong, outcomes)))
     git = ["git", "rev-parse", "HEAD"]
     commit = subprocess.run(git, cwd=REPOSITORY, capture_output=True, text=True, check=False).stdout.strip()
-    rows = defaultdict(lambda: {"scenes": 0, "refused": 0, "steps": 0, "motions": 0, "pairs": 0, "breaches": 0, "errors": 0})
-    wrong, run, begun = [], 0, time.perf_counter()
-    number = options.only or 0
+    outcomes, number, begun = [], 0, time.perf_counter()
+    known = read_log(options.log, options.seed)
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        while run < options.scenes and time.perf_counter() - begun < 60 * options.minutes:
-            for outcome in pool.map(outcome_of, names, [number] * len(names), [options.seed] * len(names)):
-                row = rows[outcome["family"]]
-                if "error" in outcome:
-                    row["errors"] += 1
-                    wrong.append(outcome)
-                    print("ERROR", json.dumps(outcome), flush=True)
-                    continue
-                if outcome["refused"]:
-                    row["refused"] += 1
-                    if options.only is not None:
-                        print(outcome["refused"])
-                    continue
-                run += 1
-                row["scenes"] += 1
-                for key in ("steps", "motions", "pairs"):
-                    row[key] += outcome[key]
-                if outcome["breaches"]:
-                    row["breaches"] += 1
-                    wrong.append(outcome)
-                    print("BREACH", json.dumps(outcome), flush=True)
-                elif options.only is not None:
-                    print(json.dumps(outcome))
+        while (result := summary(outcomes))["scenes"] < options.scenes and time.perf_counter() - begun < 60 * options.minutes:
+            new = [name for name in names if (name, number) not in known]
+            for outcome in pool.map(outcome_of, new, [number] * len(new), [options.seed] * len(new)):
+                known[outcome["family"], number] = outcome
+                if wrong(outcome):
+                    print("WRONG", json.dumps(outcome), flush=True)
+                if options.log:
+                    with options.log.open("a") as log:
+                        log.write(json.dumps(outcome | {"seed": options.seed, "commit": commit}) + "\n")
+            outcomes += [known[name, number] for name in names]
             number += 1
+            result = {"machine": machine(), "load": os.getloadavg()[1], "commit": commit, "seed": options.seed} | summary(
+                outcomes
+            )
+            options.output.write_text(json.dumps(result, indent=1) + "\n")
             seconds = time.perf_counter() - begun
-            print(f"{run} scenes in {seconds:.0f} s, breaches: {sum(row['breaches'] for row in rows.values())}", flush=True)
-            if options.only is not None:
-                return int(bool(wrong))
-    for name, row in rows.items():
+            print(f"{result['scenes']} scenes in {seconds:.0f} s, breaches: {result['breaches']}", flush=True)
+    for name, row in result["families"].items():
         print(f"{name:26}", "  ".join(f"{value:,} {key}" for key, value in row.items()))
-    total = {
-        key: sum(row[key] for row in rows.values())
-        for key in ("scenes", "refused", "steps", "motions", "pairs", "breaches", "errors")
-    }
-    result = {
-        "machine": machine(),
-        "load": os.getloadavg()[1],
-        "commit": commit,
-        "seed": options.seed,
-        "seconds": round(seconds),
-        **total,
-        "families": rows,
-        "wrong": wrong[:50],
-    }
-    options.output.write_text(json.dumps(result, indent=1) + "\n")
-    return int(bool(wrong))
+    return int(any(map(wrong, outcomes)))
+
+
+def wrong(outcome: dict) -> bool:
+    return bool("error" in outcome or outcome["breaches"])
+
+
+def read_log(path: Path | None, seed: int) -> dict[tuple[str, int], dict]:
+    """(family, number) -> outcome: what an earlier run of this seed wrote."""
+    lines = path.read_text().splitlines() if path and path.exists() else []
+    outcomes = [outcome for outcome in map(json.loads, lines) if outcome["seed"] == seed]
+    return {(outcome["family"], outcome["number"]): outcome for outcome in outcomes}
+
+
+def summary(outcomes: list[dict]) -> dict:
+    """Counts, all together and by family, and what went wrong."""
+    rows = defaultdict(lambda: {"scenes": 0, "refused": 0, "steps": 0, "motions": 0, "pairs": 0, "breaches": 0, "errors": 0})
+    for outcome in outcomes:
+        row = rows[outcome["family"]]
+        if "error" in outcome:
+            row["errors"] += 1
+        elif outcome["refused"]:
+            row["refused"] += 1
+        else:
+            row["scenes"] += 1
+            for key in ("steps", "motions", "pairs"):
+                row[key] += outcome[key]
+            row["breaches"] += bool(outcome["breaches"])
+    keys = ("scenes", "refused", "steps", "motions", "pairs", "breaches", "errors")
+    total = {key: sum(row[key] for row in rows.values()) for key in keys}
+    seconds = sum(outcome.get("seconds", 0.0) for outcome in outcomes)
+    return {"seconds": round(seconds), **total, "families": dict(rows), "wrong": list(filter(wrong, outcomes))[:50]}
 
 
 if __name__ == "__main__":
