@@ -14,14 +14,14 @@ It must end with "wrong: 0". Writes benchmarks/results/rejections.json.
 
 import argparse
 import json
+import os
+import subprocess
 import sys
 import time
 from collections import defaultdict
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(REPOSITORY / "tests"), str(REPOSITORY / "benchmarks")]
@@ -29,13 +29,12 @@ sys.path[:0] = [str(REPOSITORY / "tests"), str(REPOSITORY / "benchmarks")]
 from ccd import machine  # noqa: E402
 from collision import hard_queries, rejections  # noqa: E402
 
-from pdipc.collision import candidates  # noqa: E402
-from pdipc.device.precision import real  # noqa: E402
 from pdipc.judge import boxes, witness  # noqa: E402
 
 FAMILIES = hard_queries.FAMILIES + hard_queries.CULLING
 BATCH = 3000  # pairs of one family, kind and precision asked about at a time
 SOUPS = 2  # of each family, precision and culling in one round
+STRAYS = 150_000  # of each precision in one round
 MOTIONS = 40  # of each family and precision, for what judges
 
 
@@ -54,12 +53,12 @@ def ask_pairs(rng, counts, report) -> None:
         for precision in rejections.PRECISIONS:
             for kind in rejections.KINDS:
                 points, reach = rejections.pairs(family, kind, precision, BATCH, rng)
-                for name, ask in rejections.REJECTIONS.items():
-                    rejected = ask(points, kind, precision, reach)
-                    wrong = rejections.wrong(points, kind, reach, rejected)
-                    counts[name].add(len(points), rejected.sum(), len(wrong))
-                    for i in wrong:
-                        report(name, family, precision, kind, points[i], reach[i])
+                left_out = {name: ask(points, kind, precision, reach) for name, ask in rejections.REJECTIONS.items()}
+                wrong = rejections.wrong(points, kind, reach, np.logical_or.reduce([*left_out.values()]))
+                for name, rejected in left_out.items():
+                    counts[name].add(len(points), rejected.sum(), rejected[wrong].sum())
+                for i in wrong:
+                    report([name for name in left_out if left_out[name][i]], family, precision, kind, points[i], reach[i])
 
 
 def ask_lists(rng, counts, report) -> None:
@@ -78,27 +77,13 @@ def ask_lists(rng, counts, report) -> None:
 
 
 def ask_near(rng, counts, report) -> None:
-    """One vertex a launch, since a launch answers for all of them at once: a few are enough."""
     for precision in rejections.PRECISIONS:
-        number, n = real(precision), 500
-        exponent = rng.uniform(*((-120, 120) if precision == "float64" else (-40, 30)), (n, 1))
-        y = rng.normal(size=(n, 3)) * 10.0**exponent
-        margin = np.abs(y).max(axis=1) * 10.0 ** rng.uniform(-9, 3, n)
-        off = rng.normal(size=(n, 3)) * rng.choice([1.0, 1e-3], (n, 3))
-        off *= (margin / np.linalg.norm(off, axis=1) * (1 + rng.normal(size=n) * 10.0 ** rng.uniform(-17, -5, n)))[:, None]
-        x, y, margin = ((v.astype(precision)).astype(float) for v in (y + off, y, margin))
-        away = wp.zeros(4, dtype=wp.int32, device="cpu")
-        for i in range(n):
-            away.zero_()
-            one, other = (wp.array(v[i : i + 1], dtype=number.vec3, device="cpu") for v in (x, y))
-            depart = candidates.kernels(number).depart
-            wp.launch(depart, 1, [0, one, one, other, other, number.scalar(margin[i]), away], device="cpu")
-            near = away.numpy()[0] == 0
-            far = sum((Fraction(a) - Fraction(b)) ** 2 for a, b in zip(x[i], y[i], strict=True))
-            wrong = near and far > (Fraction(margin[i]) * (1 + Fraction(candidates.ROUNDING) / 10)) ** 2
-            counts["near"].add(1, near, wrong)
-            if wrong:
-                report("near", None, precision, "", np.stack([x[i], y[i]]), margin[i])
+        x, y, margin = rejections.strays(precision, STRAYS, rng)
+        near = rejections.is_near(x, y, margin, precision)
+        wrong = rejections.not_near(x, y, margin, near)
+        counts["near"].add(len(x), near.sum(), len(wrong))
+        for i in wrong:
+            report("near", None, precision, "", np.stack([x[i], y[i]]), margin[i])
 
 
 def ask_judge(rng, counts, report) -> None:
@@ -129,35 +114,45 @@ def ask_judge(rng, counts, report) -> None:
                 report("judge's filter", family, precision, "", np.concatenate([ends[i], corners[j]]), 0.0)
 
 
+# what is asked of culling and of CCD, until each has been asked often enough
+QUESTIONS = {ask_pairs: tuple(rejections.REJECTIONS), ask_lists: ("patches", "bvh"), ask_near: ("near",), ask_judge: ()}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=10_000_000, help="pairs to ask about, all together")
+    parser.add_argument(
+        "--pairs", type=int, default=10_000_000, help="pairs that each rejection of culling and of CCD is asked about"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=60.0, help="ends after this time, however many were asked")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "benchmarks" / "results" / "rejections.json")
     options = parser.parse_args()
-    rng, counts, examples = np.random.default_rng(options.seed), defaultdict(Count), []
+    counts, examples = defaultdict(Count), []
 
     def report(name, family, precision, kind, points, reach) -> None:
         examples.append([name, getattr(family, "__name__", ""), precision, kind, np.asarray(points).tolist(), float(reach)])
         print("WRONG", *examples[-1], flush=True)
 
-    begun, rounds = time.perf_counter(), 0
-    while True:
-        for ask in (ask_pairs, ask_lists, ask_near, ask_judge):
-            ask(rng, counts, report)
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    ).stdout.strip()
+    begun, seconds, rounds, least = time.perf_counter(), 0.0, 0, 0
+    while least < options.pairs and seconds < 60 * options.minutes:
+        for number, (ask, names) in enumerate(QUESTIONS.items()):
+            if not names or min(counts[name].asked for name in names) < options.pairs:
+                ask(np.random.default_rng([options.seed, rounds, number]), counts, report)
         rounds += 1
-        asked = sum(count.asked for name, count in counts.items() if not name.startswith("judge"))
-        seconds = time.perf_counter() - begun
-        print(f"{asked:,} pairs in {seconds:.0f} s, wrong: {sum(count.wrong for count in counts.values())}", flush=True)
-        if asked >= options.pairs or seconds > 60 * options.minutes:
-            break
-    rows = {name: vars(count) for name, count in counts.items()}
+        culling = [counts[name].asked for names in QUESTIONS.values() for name in names]
+        least, seconds = min(culling), time.perf_counter() - begun
+        wrong = sum(count.wrong for count in counts.values())
+        print(f"{sum(culling):,} questions, {least:,} or more of each kind, in {seconds:.0f} s, wrong: {wrong}", flush=True)
+        rows = {name: vars(count) for name, count in counts.items()}
+        head = {"machine": machine(), "load": os.getloadavg()[1], "commit": commit, "seed": options.seed, "rounds": rounds}
+        result = head | {"seconds": round(seconds), "pairs": sum(culling), "of": rows, "examples": examples[:20]}
+        options.output.write_text(json.dumps(result, indent=1) + "\n")
     for name, row in rows.items():
         print(f"{name:22} {row['asked']:12,} asked {row['left_out']:12,} left out {row['wrong']:6} wrong")
-    result = {"machine": machine(), "seed": options.seed, "seconds": round(seconds), "pairs": asked, "of": rows}
-    options.output.write_text(json.dumps(result | {"examples": examples[:20]}, indent=1) + "\n")
-    return int(any(count.wrong for count in counts.values()))
+    return int(wrong > 0)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ that precision.
 """
 
 import functools
+from fractions import Fraction
 
 import numpy as np
 import warp as wp
 
 from collision import exact
-from pdipc.collision import broad_phase, ccd, moving_boxes, sieve, surface
+from pdipc.collision import broad_phase, candidates, ccd, moving_boxes, sieve, surface
 from pdipc.device.launch import Device
 from pdipc.device.precision import kernel, real
 
@@ -147,6 +148,62 @@ def wrong(points, kind, reach, rejected):
     if not len(asked):
         return asked
     return asked[~exact.stays_apart(points[asked], kind, np.ones(len(asked)), 2 * reach[asked])]
+
+
+# --- what counts as near enough to use a list again ---
+
+
+def strays(precision, n, rng):
+    """(x (n, 3), y (n, 3), margin (n,)): two places about as far apart as the margin, of any size."""
+    exponent = rng.uniform(*((-120, 120) if precision == "float64" else (-40, 30)), (n, 1))
+    y = rng.normal(size=(n, 3)) * 10.0**exponent
+    margin = np.abs(y).max(axis=1) * 10.0 ** rng.uniform(-9, 3, n)
+    off = rng.normal(size=(n, 3)) * rng.choice([1.0, 1e-3], (n, 3))
+    off *= (margin / np.linalg.norm(off, axis=1) * (1 + rng.normal(size=n) * 10.0 ** rng.uniform(-17, -5, n)))[:, None]
+    return ((values.astype(precision)).astype(float) for values in (y + off, y, margin))
+
+
+@functools.cache
+def near_kernel(precision: str):
+    number = real(precision)
+    near = candidates.kernels(number).near
+    scalar, vec3 = number.scalar, number.vec3
+
+    @kernel(number.module(f"{__name__}.near"), "ask_near")
+    def ask_near(
+        x: wp.array(dtype=vec3), y: wp.array(dtype=vec3), margin: wp.array(dtype=scalar), out: wp.array(dtype=wp.int32)
+    ):
+        i = wp.tid()
+        out[i] = wp.where(near(x[i], y[i], margin[i]), 1, 0)
+
+    return ask_near
+
+
+def is_near(x, y, margin, precision):
+    """(n,) bool: whether each x counts as near its y, which promises that it is within (1 + ROUNDING / 10) of the margin."""
+    number = real(precision)
+    places = [wp.array(v, dtype=number.vec3, device="cpu") for v in (x, y)]
+    out = wp.zeros(len(x), dtype=wp.int32, device="cpu")
+    wp.launch(near_kernel(precision), len(x), [*places, wp.array(margin, dtype=number.scalar, device="cpu"), out], device="cpu")
+    return out.numpy().astype(bool)
+
+
+def not_near(x, y, margin, near):
+    """Indices of those that count as near and are not, exactly."""
+    asked = np.flatnonzero(near)
+    difference = x[asked].astype(np.longdouble) - y[asked].astype(np.longdouble)
+    far = (difference * difference).sum(axis=1)
+    limit = (margin[asked].astype(np.longdouble) * (1 + np.longdouble(candidates.ROUNDING) / 10)) ** 2
+    size = (np.abs(x[asked]) + np.abs(y[asked])).max(axis=1).astype(np.longdouble)
+    doubtful = (
+        far + 64 * np.finfo(np.longdouble).eps * (far + limit + size * np.sqrt(far)) >= limit
+    )  # with room for all that rounds
+    return np.array([i for i in asked[doubtful] if not _near_exactly(x[i], y[i], margin[i])], dtype=int)
+
+
+def _near_exactly(x, y, margin) -> bool:
+    far = sum((Fraction(a) - Fraction(b)) ** 2 for a, b in zip(x, y, strict=True))
+    return far <= (Fraction(margin) * (1 + Fraction(candidates.ROUNDING) / 10)) ** 2
 
 
 # --- whole lists: trees, patches, boxes and the sieve together ---

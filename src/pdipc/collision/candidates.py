@@ -204,6 +204,7 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(
         vertex_triangle_limits=vertex_triangle_limits,
         edge_edge_limits=edge_edge_limits,
+        near=near,
         depart=depart,
         decide=decide,
         keep=keep,
