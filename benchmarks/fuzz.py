@@ -3,8 +3,8 @@
 Good scenes (TOML, JSON, Python) and good meshes of every format that is read are damaged by mutation: bytes that are flipped, lost,
 doubled or cut off, words in place of others, values of other kinds, numbers without measure. Whatever comes of it must be read, or be
 refused by the package's own error: any other exception is foreign, and what takes longer than LIMIT is a hang. Some of the scenes
-that are found good are simulated for a step. Prints what was found, and ends with exit code 1 where there was a foreign error or a
-hang; --keep DIR keeps those inputs.
+that are found good are simulated for a step. Prints what was found, writes it to benchmarks/results/fuzz.json, and ends with exit code 1 where there was
+a foreign error or a hang; --keep DIR keeps those inputs.
 
 Each input follows from the seed and its number alone: `--only NUMBER` makes it again.
 """
@@ -16,7 +16,9 @@ import copy
 import datetime
 import io
 import json
+import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -25,6 +27,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from ccd import machine
 
 import pdipc
 from pdipc.scene import check, generators, meshes, worker
@@ -33,6 +36,7 @@ from pdipc.scene.frames import read_frames
 
 CACHES = (".npz", ".usda", ".usdc")  # formats that hold frames
 LIMIT = 60  # s of work on one input; ten times as long may pass by the clock, where the machine is busy
+OUTCOMES = ("read", "simulated", "refused", "foreign", "hang")
 STEPPED = 20  # one in so many of the scenes that are found good is simulated for a step
 worker.SECONDS = 2.0  # for the damaged files on which parsers of other packages never end
 
@@ -330,6 +334,8 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--seconds", type=float, default=float("inf"), help="no further input after this time")
     options.add_argument("--keep", type=Path, help="folder for the inputs that were not dealt with")
+    results = Path(__file__).resolve().parent / "results"
+    options.add_argument("--output", type=Path, default=results / "fuzz.json")
     options.add_argument("--only", type=int, help="the one input of this number, with its traceback")
     given = options.parse_args()
     warnings.simplefilter("ignore")
@@ -340,6 +346,18 @@ def main() -> int:
     for each in (signal.SIGALRM, signal.SIGPROF):
         signal.signal(each, late)
     counts: collections.Counter = collections.Counter()
+    bad: list[str] = []
+    git = ["git", "-C", str(results.parent), "rev-parse", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    head = {"machine": machine(), "commit": commit, "seed": given.seed}
+
+    def report() -> None:
+        total = {name: sum(count for (_, came), count in counts.items() if came == name) for name in OUTCOMES}
+        kinds = {kind: {name: counts[kind, name] for name in OUTCOMES} for kind in sorted({kind for kind, _ in counts})}
+        took = {"load": os.getloadavg()[1], "seconds": round(time.monotonic() - begun), "slowest": round(slowest[0], 1)}
+        result = head | took | {"inputs": done, **total, "kinds": kinds, "bad": bad[:50]}
+        given.output.write_text(json.dumps(result, indent=1) + "\n")
+
     begun, slowest, done = time.monotonic(), (0.0, 0), 0
     with tempfile.TemporaryDirectory() as good, tempfile.TemporaryDirectory() as made, worker.Worker() as reader:
         tables, files = scenes(), mesh_files(Path(good))
@@ -366,7 +384,8 @@ def main() -> int:
             done += 1
             counts[kind, came.split()[0]] += 1
             if came.startswith(("foreign", "hang")):
-                print(f"input {number} ({kind}): {came}", flush=True)
+                bad.append(f"input {number} ({kind}): {came}")
+                print(bad[-1], flush=True)
                 if given.keep:
                     given.keep.mkdir(parents=True, exist_ok=True)
                     data = source.read_bytes() if isinstance(source, Path) else repr(source).encode()
@@ -374,17 +393,14 @@ def main() -> int:
             elif given.only is not None:
                 print(came)
             if done % 1000 == 0:
+                report()
                 print(f"{done} inputs, {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
-    outcomes = ("read", "simulated", "refused", "foreign", "hang")
-    print(f"{'kind':8}" + "".join(f"{name:>10}" for name in outcomes))
     for kind in sorted({kind for kind, _ in counts}):
-        print(f"{kind:8}" + "".join(f"{counts[kind, name]:10}" for name in outcomes))
-    bad = {name: sum(counts[kind, name] for kind in {kind for kind, _ in counts}) for name in outcomes[3:]}
-    print(
-        f"{done} inputs of seed {given.seed}, {time.monotonic() - begun:.0f} s, the slowest {slowest[0]:.1f} s (input {slowest[1]})"
-    )
-    print(f"{bad['foreign']} foreign errors, {bad['hang']} hangs")
-    return int(any(bad.values()))
+        print(f"{kind:8}" + "".join(f"{counts[kind, name]:8} {name}" for name in OUTCOMES))
+    if given.only is None:
+        report()
+    print(f"{done} inputs, the slowest {slowest[0]:.1f} s (input {slowest[1]}), {len(bad)} foreign errors or hangs")
+    return int(bool(bad))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ writers: two, three or four processes resume the same folder at once. limits: no
 without. Each run must end with the bits of one that nothing stopped: frames, times, statistics, checkpoints, recorded motions.
 
 Runs are forks of one process that has compiled and imported everything, so that each takes a fraction of a second; on Linux and macOS.
-Exit code 1 at the first difference.
+Exit code 1 where one differs. Writes benchmarks/results/kills.json.
 """
 
 import argparse
@@ -16,10 +16,13 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from ccd import machine
 
 import pdipc
 import pdipc.simulation
@@ -167,13 +170,14 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*", choices=[[], *KINDS], default=[], metavar="KIND", help=", ".join(KINDS))
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path(__file__).resolve().parent / "results" / "kills.json")
     parser.add_argument("--folder", type=Path, help="Where runs are written; default: a temporary one.")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        sys.exit(attack(Path(folder), options.kinds or KINDS, options.count, options.seed))
+        sys.exit(attack(Path(folder), options.kinds or KINDS, options.count, options.seed, options.output))
 
 
-def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
+def attack(folder: Path, kinds: list[str], count: int, seed: int, output: Path) -> int:
     substeps = (1, 3)
     scenes, expected, seconds = {}, {}, {}
     for number in substeps:
@@ -188,7 +192,9 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
             seconds[number] = time.monotonic() - began
         expected[number] = contents(whole)
         assert open_run(whole).frame_count == 25
-    failures = 0
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    result = {"machine": machine(), "commit": commit, "seed": seed, "kinds": {}}
     for kind in kinds:
         chance = random.Random(f"{seed} {kind}")
         began, wrong = time.monotonic(), 0
@@ -211,11 +217,11 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int) -> int:
                 )
             shutil.rmtree(run, ignore_errors=True)
             log.unlink(missing_ok=True)
-        failures += wrong
-        print(
-            f"{kind:8} {count} runs, {wrong} differ from one that nothing stopped; {time.monotonic() - began:.0f} s", flush=True
-        )
-    return int(failures > 0)
+        seconds = round(time.monotonic() - began)
+        result["kinds"][kind] = {"runs": count, "differ": wrong, "seconds": seconds, "load": os.getloadavg()[1]}
+        output.write_text(json.dumps(result, indent=1) + "\n")
+        print(f"{kind:8} {count} runs, {wrong} differ from one that nothing stopped; {seconds} s", flush=True)
+    return int(any(row["differ"] for row in result["kinds"].values()))
 
 
 if __name__ == "__main__":
