@@ -217,10 +217,10 @@ def attack(folder: Path, kinds: list[str], count: int, seed: int, output: Path) 
                 )
             shutil.rmtree(run, ignore_errors=True)
             log.unlink(missing_ok=True)
-        seconds = round(time.monotonic() - began)
-        result["kinds"][kind] = {"runs": count, "differ": wrong, "seconds": seconds, "load": os.getloadavg()[1]}
+        took = round(time.monotonic() - began)
+        result["kinds"][kind] = {"runs": count, "differ": wrong, "seconds": took, "load": os.getloadavg()[1]}
         output.write_text(json.dumps(result, indent=1) + "\n")
-        print(f"{kind:8} {count} runs, {wrong} differ from one that nothing stopped; {seconds} s", flush=True)
+        print(f"{kind:8} {count} runs, {wrong} differ from one that nothing stopped; {took} s", flush=True)
     return int(any(row["differ"] for row in result["kinds"].values()))
 
 
