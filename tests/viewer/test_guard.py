@@ -1,6 +1,9 @@
 """Raw clients at the viewer's door: who has the token and comes from an allowed page gets in, nobody else."""
 
 import asyncio
+import logging
+import socket
+import time
 import urllib.error
 import urllib.request
 
@@ -114,3 +117,21 @@ def test_origins(served, origin, host, allowed):
 def test_what_is_no_origin_is_refused(origin):
     with pytest.raises(ValueError, match="is no origin of a page"):
         Guard("localhost", [origin])
+
+
+@pytest.mark.parametrize(
+    "said",
+    [b"", b"SSH-2.0-x\r\n", b"\x16\x03\x01\x02\x00", b"GET / HTTP/1.0\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b"\0" * 9000],
+)
+def test_what_speaks_no_http_is_dropped_without_a_traceback(url, said, caplog, capfd):
+    port = int(url.split(":")[2].partition("/")[0])
+    with caplog.at_level(logging.INFO, "pdipc.viewer.connections"):
+        with socket.create_connection(("localhost", port)) as connection:
+            connection.sendall(said)
+        end = time.monotonic() + 20.0
+        while not (told := [record for record in caplog.records if "opening handshake failed" in record.message]):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    assert [(record.levelname, record.exc_info) for record in told] == [("INFO", None)]
+    assert page(url) == 200
+    assert "Traceback" not in capfd.readouterr().err

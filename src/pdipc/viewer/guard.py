@@ -3,11 +3,15 @@
 A browser lets every page connect to a server on this machine, and only says where the page is from (its Origin). A page from elsewhere
 is refused, and so is one that does not know the token, which is new at every start: it stands in the path of the address, which the
 page's own script takes for its connection. viser has no place for such checks, so the function that serves is wrapped while it starts.
+
+What connects and does not speak HTTP (a scan of ports, TLS, a connection that is given up) is dropped; `logging` tells of it at level INFO, by
+the name pdipc.viewer.connections.
 """
 
 import dataclasses
 import hmac
 import http
+import logging
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -69,13 +73,28 @@ class Guard:
                     return connection.respond(http.HTTPStatus.FORBIDDEN, "Pages from elsewhere may not connect.\n")
                 return process_request(connection, dataclasses.replace(request, path=path))
 
-            return serve(*args, process_request=judged, **options)
+            return serve(*args, process_request=judged, **{"logger": _logger(), **options})
 
         server.serve = guarded  # pyright: ignore[reportAttributeAccessIssue]
         try:
             yield
         finally:
             server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _logger() -> logging.Logger:
+    """Connections that do not become any are no errors of this program: without it, each would print a traceback."""
+
+    def demote(record: logging.LogRecord) -> bool:
+        if record.msg == "opening handshake failed":
+            record.levelno, record.levelname = logging.INFO, "INFO"
+            record.msg, record.exc_info = f"{record.msg}: {(record.exc_info or ['', ''])[1]}", None
+        return True
+
+    logger = logging.getLogger("pdipc.viewer.connections")
+    if not logger.filters:
+        logger.addFilter(demote)
+    return logger
 
 
 def _normal(origin: str) -> str:
