@@ -125,6 +125,16 @@ def mesh_files(folder: Path) -> list[Path]:
         surface.export(folder / name)
     surface.export(folder / "b.ply", encoding="ascii")
     surface.export(folder / "b.stl", file_type="stl_ascii")
+    head = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n0 0 0 1 0 0 0 0 1 1 0 1\n"
+    (folder / "c.vtk").write_text(head + "POLYGONS 1 4\n3 0 1 2\nTRIANGLE_STRIPS 1 5\n4 0 1 2 3\nLINES 1 3\n2 0 3\n")
+    with contextlib.suppress(ImportError):
+        import pyvista
+
+        shown = pyvista.PolyData.from_regular_faces(skin.vertices, skin.triangles)
+        shown.save(folder / "a.vtp")
+        shown.save(folder / "b.vtp", binary=False)
+        shown.save(folder / "d.vtk")
+        shown.cast_to_unstructured_grid().save(folder / "c.vtu")
     np.savez(folder / "a.npz", V=ball.vertices, T=ball.tets)
     np.savez_compressed(folder / "b.npz", V=ball.vertices, F=ball.triangles)
     np.savez(folder / "c.npz", V=np.stack([skin.vertices, 2 * skin.vertices]), F=skin.triangles, times=[0.0, 1.0])

@@ -330,3 +330,28 @@ def test_memory_that_is_free_is_that_of_the_machine_or_of_its_container(monkeypa
     assert memory.free_memory() == 600
     (tmp_path / "memory.max").write_text("max\n")
     assert memory.free_memory() == pytest.approx(whole, rel=0.5)
+
+
+def test_obstacles_are_judged_also_where_no_body_is_right(tmp_path):
+    """One pass finds what is wrong in the tables and what is wrong in the files that they name."""
+    for bodies in ("bodies = []\n", "bodies = 3\n", '[[bodies]]\nname = "c"\nkind = "clth"\n'):
+        (tmp_path / "a.toml").write_text(
+            bodies + '[simulation]\ntime_step = -1\n[[obstacles]]\nname = "o"\nmesh = "none.obj"\n'
+        )
+        found = [str(finding) for finding in check.check_file(tmp_path / "a.toml")[0]]
+        assert len(found) == 3
+        assert any(line.startswith("bodies") for line in found) and any("time_step" in line for line in found)
+        assert re.search(r'obstacle "o".*none\.obj.*no such file', found[-1])
+
+
+@pytest.mark.parametrize("place", [1e30, 1e200, 1e300])
+def test_a_rigid_body_beyond_all_numbers(place):
+    body = {"name": "r", "kind": "rigid", "mesh": {"shape": "box", "cells": [1, 1, 1]}, "translation": [place, 0, 0]}
+    with np.errstate(all="ignore"):
+        (found,) = check.check(pdipc.Scene(bodies=[body]))
+    assert re.search(r'body "r": rest_positions .* beyond 1e\+09 m', str(found))
+
+
+def test_gravity_beyond_all_numbers():
+    (found,) = check.check(pdipc.Scene(simulation={"gravity": [0, -1e300, 0]}, bodies=[cloth()]))
+    assert str(found).startswith("simulation.gravity: is [0.0, -1e+300, 0.0]")

@@ -382,6 +382,107 @@ def test_usd_that_moves_or_has_no_unit_is_said(tmp_path):
     ]
 
 
+GRID_HEAD = "# vtk DataFile Version 3.0\n\nASCII\nDATASET {}\nPOINTS 8 float\n0 0 0 1 0 0 0 1 0 1 1 0 0 0 1 1 0 1 0 1 1 1 1 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "area_right", "volume_right"),
+    [
+        ("UNSTRUCTURED_GRID|CELLS 1 9\n8 0 1 2 3 4 5 6 7\nCELL_TYPES 1\n11\n", 6.0, 1.0),  # a voxel
+        (
+            "UNSTRUCTURED_GRID|CELLS 2 10\n4 0 1 2 3\n4 4 5 6 7\nCELL_TYPES 2\n8\n8\nPOINT_DATA 8\nSCALARS a float\n",
+            2.0,
+            0.0,
+        ),  # pixels
+        ("POLYDATA|VERTICES 1 2\n1 0\nTRIANGLE_STRIPS 1 9\n8 0 1 2 3 6 7 4 5\n", 3.0, 0.0),  # three sides of a cube
+        ("POLYDATA|FIELD f 1\nx 1 2 int\n5 6\nPOLYGONS 2 9\n3 0 1 3\n4 4 5 7 6\nCELL_DATA 2\n", 1.5, 0.0),
+    ],
+)
+def test_cells_that_other_readers_of_vtk_leave_out(tmp_path, text, area_right, volume_right):
+    kind, cells_of = text.split("|")
+    (tmp_path / "a.vtk").write_text(GRID_HEAD.format(kind) + cells_of)
+    mesh = meshes.read(tmp_path / "a.vtk")
+    assert area(mesh) == pytest.approx(area_right)
+    if volume_right:
+        assert volume(mesh) == pytest.approx(volume_right)
+    assert mesh.notes == []
+
+
+@pytest.mark.parametrize("compressor", ["None", "ZLib", "LZMA"])
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "encoded"])
+def test_every_encoding_of_vtk_itself(tmp_path, mode, compressor):
+    """Grids and surfaces, with heads of 32 and 64 bits, of both orders of bytes, in several blocks; the legacy versions too."""
+    vtk = pytest.importorskip("vtk")
+    ball = vtk.vtkSphereSource()
+    strips = vtk.vtkStripper()
+    strips.SetInputConnection(ball.GetOutputPort())
+    strips.Update()
+    surface, grid = strips.GetOutput(), vtk.vtkUnstructuredGrid()
+    image = vtk.vtkImageData()
+    image.SetDimensions(3, 3, 3)
+    append = vtk.vtkAppendFilter()
+    append.AddInputData(image)
+    append.Update()
+    grid = append.GetOutput()  # of eight voxels
+    measure = vtk.vtkMassProperties()
+    measure.SetInputConnection(ball.GetOutputPort())
+    for bits, big in ((32, True), (64, False)):
+        for data, writer, name in (
+            (grid, vtk.vtkXMLUnstructuredGridWriter(), "a.vtu"),
+            (surface, vtk.vtkXMLPolyDataWriter(), "a.vtp"),
+        ):
+            writer.SetInputData(data)
+            writer.SetFileName(str(tmp_path / name))
+            getattr(writer, f"SetDataModeTo{'Appended' if mode == 'encoded' else mode}")()
+            writer.SetEncodeAppendedData(mode == "encoded")
+            getattr(writer, f"SetCompressorTypeTo{compressor}")()
+            getattr(writer, f"SetHeaderTypeToUInt{bits}")()
+            writer.SetByteOrder(0 if big else 1)
+            writer.SetBlockSize(256)
+            writer.Write()
+        assert volume(meshes.read(tmp_path / "a.vtu")) == pytest.approx(8.0)
+        assert area(meshes.read(tmp_path / "a.vtp")) == pytest.approx(measure.GetSurfaceArea(), rel=1e-5)
+    for data, writer in ((grid, vtk.vtkUnstructuredGridWriter()), (surface, vtk.vtkPolyDataWriter())):
+        writer.SetInputData(data)
+        writer.SetFileName(str(tmp_path / "a.vtk"))
+        writer.SetFileVersion(42 if mode == "Ascii" else 51)
+        writer.SetFileType(1 if compressor == "None" else 2)
+        writer.Write()
+        mesh = meshes.read(tmp_path / "a.vtk")
+        assert (volume(mesh) if data is grid else area(mesh)) == pytest.approx(
+            8.0 if data is grid else measure.GetSurfaceArea(), rel=1e-5
+        )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("CELLS 1 9", "CELLS 1 8", "do not have the vertices"),
+        ("CELLS 1 9", "CELLS 1 99", "could not convert string"),
+        ("8 0 1 2 3 4 5 6 7", "8 0 1 2 3 4 5 6 9", "out of range"),
+        ("\n11\n", "\n12 13\n", "12 13|not known"),
+        ("\n11\n", "\n10\n", "a tetra has 8 vertices; needed: 4"),
+        ("8 float", "8 flaot", "type flaot"),
+        ("ASCII", "ASKII", "needed: ASCII or BINARY"),
+        ("CELL_TYPES 1\n11\n", "", "no CELL_TYPES"),
+    ],
+)
+def test_damaged_files_of_vtk(tmp_path, old, new, message):
+    good = GRID_HEAD.format("UNSTRUCTURED_GRID") + "CELLS 1 9\n8 0 1 2 3 4 5 6 7\nCELL_TYPES 1\n11\n"
+    (tmp_path / "a.vtk").write_text(good.replace(old, new))
+    with pytest.raises(SceneError, match=rf"a\.vtk.*({message})"):
+        meshes.read(tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize(("head", "message"), [('upAxis = "X"', "needed: Y or Z"), ("metersPerUnit = 0", "a number above 0")])
+def test_a_stage_without_a_right_unit_or_axis(tmp_path, head, message):
+    pytest.importorskip("pxr", reason='the extra "usd" is not installed')
+    mesh = "int[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 1, 2]\npoint3f[] points = [(0, 0, 0), (1, 0, 0), (0, 0, 1)]"
+    (tmp_path / "a.usda").write_text(f'#usda 1.0\n(\n{head}\n)\ndef Mesh "m"\n{{\n{mesh}\n}}\n')
+    with pytest.raises(SceneError, match=message):
+        meshes.read(tmp_path / "a.usda")
+
+
 def test_a_glb_says_what_it_leaves_out(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     scene = trimesh.Scene()
@@ -419,16 +520,16 @@ def test_parsers_that_never_end_are_ended(tmp_path, monkeypatch, text, message):
 def test_one_process_reads_many_files_and_goes_on_after_a_failure(tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "SECONDS", 1.0)  # of work; how long that takes by the clock is the machine's
     monkeypatch.setattr(worker, "WAITING", 600.0)
-    meshio.Mesh(QUAD_AND_TRIANGLES, [("triangle", [[1, 2, 5]])]).write(tmp_path / "good.vtu")
-    (tmp_path / "bad.vtu").write_text("nonsense")
+    meshio.Mesh(QUAD_AND_TRIANGLES, [("triangle", [[1, 2, 5]])]).write(tmp_path / "good.msh", file_format="ansys")
+    (tmp_path / "bad.msh").write_text("nonsense")
     (tmp_path / "endless.msh").write_text("(10 (0 1 1b 0))\n(301")
     with worker.Worker() as reader:
-        first = meshes.read(tmp_path / "good.vtu", reader)
+        first = meshes.read(tmp_path / "good.msh", reader)
         process = reader.process
-        for name in ("bad.vtu", "endless.msh"):
+        for name in ("bad.msh", "endless.msh"):
             with pytest.raises(SceneError):
                 meshes.read(tmp_path / name, reader)
-        again = meshes.read(tmp_path / "good.vtu", reader)
+        again = meshes.read(tmp_path / "good.msh", reader)
     assert np.array_equal(first.vertices, again.vertices)
     assert process.poll() is not None and reader.process is None, "none is left behind"
 

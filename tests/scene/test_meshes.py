@@ -106,7 +106,7 @@ def test_a_surface_is_filled_with_tets():
         ("a.xyz", "", r'the format ".xyz" is not known; allowed: .msh'),
         ("a.obj", None, "there is no such file"),
         ("a.msh", "nonsense", "cannot be read as .msh"),
-        ("a.vtk", "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n", "cannot be read as .vtk: .*POLYDATA"),
+        ("a.vtk", "# vtk DataFile Version 3.0\nx\nASCII\nDATASET FIELD\n", "cannot be read as .vtk: .*FIELD"),
         (
             "a.mesh",
             "MeshVersionFormatted 2\nDimension 3\nVertices\n1\n0 0 0 0\nEnd\n",

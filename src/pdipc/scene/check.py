@@ -154,6 +154,8 @@ def _settings(scene: Scene) -> Iterator[Finding]:
     if sim.nonlinear_solver == "newton":
         for name in local_global_settings(sim):
             yield Finding(f"simulation.{name}", "has no effect with the Newton solver", 'leave it out, or take "local-global"')
+    if max(map(abs, sim.gravity)) > LARGEST:
+        yield Finding("simulation.gravity", f"is {list(sim.gravity)}", f"at most {LARGEST:g} m/s^2 along each axis")
     if method == "paper" and sim.nonlinear_solver != "auto":
         found = f'is "{sim.nonlinear_solver}", but the paper\'s contact has its own'
         yield Finding("simulation.nonlinear_solver", found, "leave it out")

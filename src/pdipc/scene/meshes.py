@@ -19,7 +19,7 @@ from pdipc.scene.memory import free_memory, gib
 from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
-TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
+TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".vtp", ".glb")
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", *USD_SUFFIXES)
 BYTES_PER_BYTE = 2  # of memory for a mesh file, at least: the file itself and its numbers

@@ -36,7 +36,10 @@ class Inertia:
 
 
 def inertia(vertices: np.ndarray, triangles: np.ndarray) -> Inertia:
-    """Of the inside of a closed surface, of uniform density; the volume is negative where it faces inward."""
+    """Of the inside of a closed surface, of uniform density; the volume is negative where it faces inward.
+
+    Where that is no number, because there is no inside, or numbers are too large, it is that of a ball, for `check` to refuse.
+    """
     origin = vertices[triangles].mean(axis=(0, 1))
     a, b, c = np.moveaxis(vertices[triangles] - origin, 1, 0)
     six = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -44,6 +47,8 @@ def inertia(vertices: np.ndarray, triangles: np.ndarray) -> Inertia:
     total = a + b + c
     center = np.einsum("i,ij->j", six, total) / 24.0 / volume
     square = sum(np.einsum("i,ij,ik->jk", six, p, p) for p in (a, b, c, total)) / 120.0 / volume - np.outer(center, center)
+    if not np.isfinite(square).all():
+        return Inertia(float(volume), origin, np.ones(3), np.eye(3))
     values, axes = np.linalg.eigh(square)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     radii = np.sqrt(np.maximum(values, 0.0))

@@ -6,12 +6,12 @@ see `pdipc.scene.worker`.
 
 from pathlib import Path
 
-from pdipc.scene.files import foreign, surfaces, volumes
+from pdipc.scene.files import foreign, surfaces, volumes, vtk
 from pdipc.scene.files.contents import Contents
 
 READERS = {
     ".msh": volumes.msh, ".mesh": volumes.medit, ".node": volumes.tetgen, ".ele": volumes.tetgen,
-    ".vtk": foreign.by_meshio, ".vtu": foreign.by_meshio, ".glb": foreign.glb,
+    ".vtk": vtk.legacy, ".vtu": vtk.xml, ".vtp": vtk.xml, ".glb": foreign.glb,
     ".usd": foreign.usd, ".usda": foreign.usd, ".usdc": foreign.usd,
     ".obj": surfaces.obj, ".ply": surfaces.ply, ".stl": surfaces.stl, ".off": surfaces.off, ".npz": surfaces.npz,
 }  # fmt: skip
@@ -27,9 +27,10 @@ def parse(path: Path, frames: bool = False, prim: str | None = None) -> Contents
 
 
 def reader(path: Path):
-    """The function that reads a file: some that call themselves .msh are not of Gmsh, or of a version that meshio knows better."""
+    """The function that reads a file: meshio reads a .msh that is not of Gmsh or of an old version, and the regular grids of a .vtk."""
     own = READERS[path.suffix.lower()]
-    return foreign.by_meshio if own is volumes.msh and not volumes.is_known(path) else own
+    known = {volumes.msh: volumes.is_known, vtk.legacy: vtk.is_known}.get(own)
+    return own if known is None or known(path) else foreign.by_meshio
 
 
 def is_foreign(path: Path) -> bool:

@@ -204,7 +204,12 @@ def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
     if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         unit = UsdGeom.GetStageMetersPerUnit(stage)
         notes = [f"its unit of {unit:g} m was converted to m"] if unit != 1.0 else []
-    upright = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    if not (np.isfinite(unit) and unit > 0.0):
+        raise Damaged(f"its metersPerUnit is {unit:g}; needed: a number above 0")
+    axis = UsdGeom.GetStageUpAxis(stage)
+    if axis not in (UsdGeom.Tokens.y, UsdGeom.Tokens.z):
+        raise Damaged(f'its upAxis is "{axis}"; needed: Y or Z')
+    upright = axis == UsdGeom.Tokens.y
     if not upright:
         notes.append("its z axis, which points up, was turned to y")
 
