@@ -53,7 +53,7 @@ class Work:
         self.x_start, self.rest, self.v_start, self.a_start = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
         self.x, self.v, self.a, self.rest_end = model.initial_state().positions, zeros(vec3), zeros(vec3), zeros(vec3)
         self.u, self.u_tilde, self.x_tilde, self.z = zeros(vec3), zeros(vec3), zeros(vec3), zeros(vec3)
-        self.script = Script(model.assembly, device, real, settings.time_step)
+        self.script = Script(model.assembly, device, real, settings.time_step, settings.max_outer)
         self.loads = Loads(device, real, model.external)
         self.count, self.going, self.foreign = zeros(wp.int32, status.COUNTS), zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(status.STAGES) + 2)

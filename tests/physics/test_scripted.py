@@ -1,9 +1,13 @@
 """What follows a script and is held up: it goes as far as the step allows, and the result says how far behind it is."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 import pdipc
+from pdipc.integration import status
+from pdipc.integration.script import PATIENCE
 from pdipc.scene.check import check
 from physics.scenes import cloth, floor, scene, watched
 
@@ -88,3 +92,40 @@ def test_more_frames_in_a_step_than_can_be_followed_are_refused():
     made = scene([cloth("sheet", [0.4, 0.4], [2, 2], at=(0, 1, 0))], [plate], time_step=0.005)
     (finding,) = check(made)
     assert "has 5001 keyframes or frames within a step" in str(finding)
+
+
+def test_what_is_stopped_pushes_for_a_part_of_the_step_and_leaves_the_rest_to_what_it_pushed():
+    """Six plates close on two balls and a cloth further than these can give: the last outer iterations of a step are for them alone."""
+    plates = []
+    for axis, side in itertools.product(range(3), (-1.0, 1.0)):
+        size, at, velocity = [0.3] * 3, [0.0] * 3, [0.0] * 3
+        size[axis], at[axis], velocity[axis] = 0.02, 0.085 * side, -side
+        mesh = {"shape": "box", "size": size, "cells": [1, 1, 1]}
+        plates.append({"name": f"plate {axis} {side:+.0f}", "mesh": mesh, "translation": at, "motion": {"velocity": velocity}})
+    material = {"young_modulus": 1e5, "poisson_ratio": 0.4}
+    balls = [
+        {"name": name, "kind": "solid", "mesh": {"shape": "sphere", "radius": 0.03, "cells": 4}, "material": material}
+        | {"translation": at}
+        for name, at in (("left", [-0.034, 0.001, 0.002]), ("right", [0.034, -0.002, 0.001]))
+    ]
+    bodies = [*balls, cloth("sheet", (0.12, 0.12), (8, 8), at=(0.0, 0.04, 0.0))]
+    cap = 30
+    simulation = pdipc.Simulation(scene(bodies, plates, gravity=[0, 0, 0], time_step=0.02, max_outer=cap), "cpu")
+    work = simulation.work
+    work.recorded = False
+    accept, moving = work.method.accept, []
+
+    def noted():
+        accept()
+        moving.append((int(work.count.numpy()[status.SINCE]), bool(work.count.numpy()[status.MOVING])))
+
+    work.method.accept = noted
+    for _ in range(4):
+        result = simulation.step()
+        assert (
+            len(pdipc.find_intersections(simulation.positions, simulation.triangles, simulation.model.assembly.obstacle)) == 0
+        )
+    assert result.lag > 0.01
+    assert max(since for since, _ in moving) > PATIENCE * cap + 1, "else this shows nothing"
+    assert any(moves for _, moves in moving)
+    assert not any(moves for since, moves in moving if since > PATIENCE * cap + 1)

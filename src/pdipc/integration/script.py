@@ -15,7 +15,8 @@ activation distance.
 
 Who waits: a mover that was stopped goes on in every second outer iteration, so that the others make way in between, as long as no pair of it
 is squeezed, and no body that it would push on is held back (`nonlinear.newton`) or was just stopped as a whole, and for at most TRIES times from
-one waypoint to the next; then it is late. It follows its script from where it was
+one waypoint to the next; then it is late. Nor does it go on once PATIENCE of all outer iterations that a step may have are over since something came to a
+waypoint: the rest is for what is squeezed to come to rest, so that the step converges for where the mover stands. It follows its script from where it was
 stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again.
 """
 
@@ -30,12 +31,14 @@ from scipy.spatial.transform import Rotation
 
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
+from pdipc.integration import status
 from pdipc.scene.assembly import Assembly
 from pdipc.scene.motion import Approach, Deforming, Trajectory
 from pdipc.scene.movers import MOST, Mover, movers_of
 
 CATCH_UP = 2.0  # times the script's pace
 TRIES = 24  # outer iterations in which a mover goes on to one waypoint
+PATIENCE = 0.7  # of the cap of outer iterations
 AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
 
 
@@ -130,6 +133,8 @@ def kernels(real: Real) -> SimpleNamespace:
         movers: int,
         leaders: wp.array(dtype=wp.int32),
         fraction: wp.array(dtype=scalar),
+        progress: wp.array(dtype=wp.int32),
+        patience: int,
         count: wp.array(dtype=wp.int32),
         behind: wp.array(dtype=wp.int32),
         crowded: wp.array(dtype=wp.int32),
@@ -140,10 +145,11 @@ def kernels(real: Real) -> SimpleNamespace:
         flags_out: wp.array(dtype=wp.int32),
         chords_out: wp.array(dtype=wp.int32),
     ):
-        """Who goes on in the next outer iteration, and where to."""
+        """Who goes on in the next outer iteration, and where to. progress: the `count` of the step; patience: outer iterations."""
         for k in range(3):
             flags_out[k] = 0
         for m in range(movers):
+            may = crowded[m] == 0 and tries[m] < TRIES and progress[status.SINCE] < patience
             goes = int(0)
             under_way = int(1)
             if behind[m] == 0:
@@ -159,11 +165,11 @@ def kernels(real: Real) -> SimpleNamespace:
                         goes = 1
             elif drive[m] != 0:
                 left[m] = left[m] * (scalar(1.0) - fraction[leaders[m]])
-            elif crowded[m] == 0 and tries[m] < TRIES:
+            elif may:
                 goes = 1
             if under_way != 0:
                 flags_out[AHEAD] = 1
-                if goes != 0 or (crowded[m] == 0 and tries[m] < TRIES):
+                if goes != 0 or may:
                     flags_out[WILL] = 1
             drive[m] = goes
             tries[m] = tries[m] + goes
@@ -264,9 +270,9 @@ class Script:
     moves: whether anything leaves its place. generation: grows when that changes.
     """
 
-    def __init__(self, assembly: Assembly, device: Device, real: Real, h: float):
+    def __init__(self, assembly: Assembly, device: Device, real: Real, h: float, max_outer: int):
         self.assembly, self.device, self.real, self.h, self.kernels = assembly, device, real, h, kernels(real)
-        self.movers, self.generation = movers_of(assembly), 0
+        self.movers, self.generation, self.patience = movers_of(assembly), 0, int(PATIENCE * max_outer)
         self.leads: dict[int, Lead] = {}
         self.soft = rows_of_anchors(assembly)
         self.anchors: np.ndarray | None = None
@@ -505,15 +511,17 @@ class Script:
         inputs = [self.members, self.mover, self.points, self.at, *table, *corners, x_start, self.goal, self.target]
         self.device.launch(self.kernels.aim, self.member_count, inputs)
 
-    def advance(self, x_start: wp.array, u: wp.array, fraction: wp.array) -> None:
-        """After a motion to x_start + u was made, of which each vertex kept `fraction`: who goes on, and where to."""
+    def advance(self, x_start: wp.array, u: wp.array, fraction: wp.array, progress: wp.array) -> None:
+        """After a motion to x_start + u was made, of which each vertex kept `fraction`: who goes on, and where to. progress: the step's `count`."""
         if not self.movers:
             return
         k, device = self.kernels, self.device
         device.launch(k.clear, len(self.movers), [self.behind])
         device.launch(k.compare, self.member_count, [self.members, self.mover, x_start, self.target, u, self.behind])
         states = [self.behind, self.crowded, self.at, self.left, self.tries, self.drive, self.flags, self.chords]
-        device.launch_serial(k.advance, [len(self.movers), self.leaders, fraction, self.count, *states])
+        device.launch_serial(
+            k.advance, [len(self.movers), self.leaders, fraction, progress, self.patience, self.count, *states]
+        )
         self._aim(x_start)
 
 

@@ -646,7 +646,7 @@ class Descent:
             inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
             inputs += [self.squeezed, self.restraint, w.script.crowded]
             device.launch(k.crowd, p.capacity, inputs)
-        w.script.advance(w.x_start, w.u, t.fraction)
+        w.script.advance(w.x_start, w.u, t.fraction, w.count)
         s = model.settings
         states = [
             self.pairs.count,

@@ -123,7 +123,7 @@ class Printed(Iterations):
         self.largest.sum(self.moved, self.committed)
         motion = [t.u_end, t.x_end, w.u, w.x]
         self.device.launch(self.kernels.commit, n, [w.candidates.overflow, self.numbers, *motion])
-        w.script.advance(w.x_start, w.u, t.fraction)
+        w.script.advance(w.x_start, w.u, t.fraction, w.count)
         self._lead()
         self.largest.max(self.lags, self.numbers, status.LAG)
         s = self.model.settings
