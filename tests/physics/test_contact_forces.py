@@ -192,3 +192,27 @@ def test_forces_of_names_that_do_not_exist_are_refused():
     assert forces.on("a", "b").total == pytest.approx(np.zeros(3))
     with pytest.raises(KeyError, match='no body "c"; there are: a, b'):
         forces.on("c")
+
+
+def test_friction_is_bounded_by_the_normal_forces_that_a_step_ends_with():
+    """A block is thrown at a plate that comes down: before the step has converged its contacts are squeezed, and push a hundred times as hard as
+    they do in the end. Friction that kept those normal forces was 2 and 7 times the normal force."""
+    thrown = solid("thrown", (0.372, 0.248, 0.248), (2, 3, 2), at=(-0.282, 0.576, 0.321), young=888e3, poisson=0.376)
+    thrown |= {"rotation": [71.1, 0.902, 17.9], "velocity": [-5.13, 11.0, -2.39], "angular_velocity": [-6.36, 7.21, 8.14]}
+    plate = {"name": "plate", "mesh": {"shape": "plane", "size": 1.24}, "rotation": [180.0, 0.0, 0.0]}
+    plate |= {"translation": [0.0, 2.48, 0.0], "motion": {"velocity": [0.0, -11.1, 0.0]}}
+    rod = {"name": "rod", "mesh": {"shape": "cylinder", "radius": 0.00724, "length": 1.24, "cells": [8, 1]}}
+    rod |= {"rotation": [90.0, 58.2, 0.0], "translation": [0.0, 0.149, 0.0]}
+    simulation = pdipc.Simulation(
+        scene([thrown], [floor(4.96), plate, rod], contact={"friction": 0.5}, time_step=0.00794), "cpu"
+    )
+    touched = 0
+    for _ in range(11):
+        result = simulation.step(forces=True)
+        normal, friction = (
+            float(np.linalg.norm(force, axis=1).sum()) for force in (result.forces.normal, result.forces.friction)
+        )
+        assert result.converged
+        assert friction <= 0.6 * normal
+        touched += normal > 0.0
+    assert touched >= 2

@@ -27,9 +27,8 @@ from pdipc.device.sums import BodySums
 from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 
-FRICTION_LAGS = (
-    12  # outer iterations in which the normal forces of friction are renewed; then they stay, so that a limit is reached
-)
+FRICTION_LAGS = 12  # outer iterations without restraint in which friction's normal forces are renewed; then they stay, so that a limit is reached
+STALE = 2.0  # times what contacts push with now, or the other way round: normal forces that friction does not end with
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -246,13 +245,17 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         u_end: wp.array(dtype=vec3),
         x_end: wp.array(dtype=vec3),
+        barrier: wp.array(dtype=vec3),
         u_out: wp.array(dtype=vec3),
         x_out: wp.array(dtype=vec3),
         lag_out: wp.array(dtype=scalar),
+        push_out: wp.array(dtype=scalar),
     ):
-        """The motion is made. lag: how far a scripted vertex is from its goal, m."""
+        """The motion is made. lag: how far a scripted vertex is from its goal, m. push: the force of barriers on it, N, where that is asked for."""
         i = first + wp.tid()
         lag_out[i] = scalar(0.0)
+        if barrier:
+            push_out[i] = wp.length(barrier[i])
         if overflow[0] == 0:
             u_out[i] = u_end[i]
             x_out[i] = x_end[i]
@@ -384,7 +387,9 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.OUTER] = count[status.OUTER] + 1
             count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
-            lagging[0] = lagging[0] - 1
+            # what is squeezed pushes far more than it will in the end: friction waits for it, for half of the step at most
+            if restrained[0] == 0 or 2 * count[status.SINCE] > max_outer:
+                lagging[0] = lagging[0] - 1
             if script[ARRIVED] != 0:
                 count[status.SINCE] = 0
                 count[status.STALLED] = 0
@@ -402,6 +407,13 @@ def kernels(real: Real) -> SimpleNamespace:
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
+            if lagging[0] > 0:
+                numbers[status.PUSH_TAKEN] = numbers[status.PUSH]
+            elif settled and 2 * count[status.SINCE] <= max_outer:
+                least = wp.min(numbers[status.PUSH], numbers[status.PUSH_TAKEN])
+                if wp.max(numbers[status.PUSH], numbers[status.PUSH_TAKEN]) > scalar(STALE) * least:
+                    lagging[0] = FRICTION_LAGS
+                    settled = False
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind and script[AHEAD] == 0:
@@ -525,7 +537,7 @@ class Descent:
         vec3, scalar = real.vec3, real.scalar
         self.inertial, self.p = zeros(vec3), zeros(vec3, n + 1)
         self.vertex_energy = zeros(wp.float64)
-        self.lags, self.numbers = zeros(scalar), zeros(scalar, status.NUMBERS)
+        self.lags, self.pushes, self.numbers = zeros(scalar), zeros(scalar), zeros(scalar, status.NUMBERS)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
@@ -535,7 +547,7 @@ class Descent:
         self.attempts, self.searching, self.hits, self.lagging, self.project, self.restrained, self.lowered = flags
         self.restraint = zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest = Largest(device, real, [n])
+        self.largest = Largest(device, real, [n, n])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -636,8 +648,9 @@ class Descent:
 
         device.loop(self.searching, search)
         inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
-        device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
-        self.largest.find([self.lags], self.numbers, [status.LAG])
+        barrier = None if self.friction is None else self.pairs.force_of_vertex
+        device.launch(k.commit, n, [*inputs, barrier, w.u, w.x, self.lags, self.pushes])
+        self.largest.find([self.lags, self.pushes], self.numbers, [status.LAG, status.PUSH])
         self._keep_energies()
         if w.script.moves:
             p = self.pairs
