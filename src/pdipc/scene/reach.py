@@ -1,7 +1,11 @@
-"""What the activation distance means beside bodies and steps: hints, not findings, since any distance is feasible.
+"""What the activation distance and the precision mean beside bodies and steps: hints, not findings, since any is feasible.
 
 A step that goes over many activation distances meets the barrier only after CCD has cut it, again and again; and a body of few of them is held off by
 an air gap that can be seen. Where many and few begin is a choice.
+
+Sound, of the speed c = sqrt(E / rho), crosses c h / l elements of the size l in a step h, and the square of that number is a body's elastic stiffness over its
+inertia. Where rounding times it is more than one, what rounds in elastic forces is more than inertia. Measured in float32: four scenes of small stiff bodies
+with 5e7 to 1e9 ended 11 of 48 steps at the cap of outer iterations, in float64 1 of 48; a single body with up to 3e8 none of 60.
 """
 
 import itertools
@@ -9,14 +13,17 @@ import itertools
 import numpy as np
 
 from pdipc.scene.assembly import Assembly
-from pdipc.scene.schema import Scene
+from pdipc.scene.schema import Scene, SolidMaterial
 
+STIFF = 2.0  # times single precision's unit roundoff: the square of the elements that sound may cross in a step
 FAR, THICK = 100.0, 0.05  # activation distances that a step may go over; and their part of a body's size
 MOMENTS = 60  # of the run, between which scripted vertices are looked at
 
 
 def hints(scene: Scene, assembly: Assembly) -> list[str]:
-    """A line for each body whose start or script goes over many activation distances a step, and for each that is thin beside one."""
+    """A line for each body whose start or script goes over many activation distances a step, for each that is thin beside one, and for each solid that
+    is too stiff for float32.
+    """
     d_hat, h = assembly.activation_distance, scene.simulation.time_step
     found = []
     for body in assembly.bodies:
@@ -34,6 +41,19 @@ def hints(scene: Scene, assembly: Assembly) -> list[str]:
                 f'the activation distance of {d_hat:.3g} m is {100 * d_hat / size:.0f} % of the size of "{body.name}", '
                 f"{size:.3g} m, so others are felt from that far; {1e-3 * size:.2g} m would be the default for it alone"
             )
+        if body.kind == "solid" and scene.simulation.precision == "float32":
+            assert isinstance(body.material, SolidMaterial)
+            corners = assembly.positions[body.tets]
+            element = float(
+                min(np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min() for a, b in itertools.combinations(range(4), 2))
+            )
+            crossed = np.sqrt(body.material.young_modulus / body.material.density) * h / element
+            most = np.sqrt(STIFF / 2.0**-24)
+            if crossed > most:
+                found.append(
+                    f'sound crosses {crossed:.0f} elements of "{body.name}" in a step, and with more than {most:.0f} what float32 rounds in elastic forces '
+                    f"outweighs inertia, so steps may end at the cap of outer iterations: use float64, a rigid body, or a time step of {h * most / crossed:.2g} s"
+                )
     return found
 
 
