@@ -70,12 +70,11 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
+    wide, wide3, wide4, wide33 = wp.float64, wp.vec3d, wp.vec4d, wp.mat33d
     module = real.module(__name__)
     element = wp.types.vector(CORNERS, wp.int32)
     edges, symmetric = tets.functions(real), eigen.functions(real_of("float64")).symmetric
     table = wp.types.matrix((4, CORNERS), wide)
-    mat12 = wp.types.matrix((12, 12), wide)
     zero, half, one, two = (wp.constant(wide(value)) for value in (0.0, 0.5, 1.0, 2.0))
 
     @wp.struct
@@ -156,11 +155,21 @@ def kernels(real: Real) -> SimpleNamespace:
         return (c * c) * ee, (half * c / s.across) * ew, ww
 
     @wp.func
-    def put(m: mat12, i: int, j: int, b: wide33) -> mat12:
-        for r in range(3):
-            for k in range(3):
-                m[3 * i + r, 3 * j + k] = b[r, k]
-        return m
+    def mirrored(m: wide33) -> wide33:
+        """Symmetric: what is below the diagonal as above it."""
+        return wide33(
+            m[0, 0], m[0, 1], m[0, 2],
+            m[0, 1], m[1, 1], m[1, 2],
+            m[0, 2], m[1, 2], m[2, 2],
+        )  # fmt: skip
+
+    @wp.func
+    def plus(total: wide33, part: wide, to: wide4, a: wide33, b: wide33, c: wide33, d: wide33) -> wide33:
+        """total + part (to_0 a + to_1 b + to_2 c + to_3 d), one after the other."""
+        total = total + (part * to[0]) * a
+        total = total + (part * to[1]) * b
+        total = total + (part * to[2]) * c
+        return total + (part * to[3]) * d
 
     @wp.func
     def narrow(a: wide3) -> vec3:
@@ -248,26 +257,27 @@ def kernels(real: Real) -> SimpleNamespace:
             cross = -own
         jea, jwa = turning(a)
         jeb, jwb = turning(b)
-        h = mat12()
-        h = put(h, 0, 0, wp.transpose(jea) * own * jea)
-        h = put(h, 0, 1, wp.transpose(jea) * own * jwa)
-        h = put(h, 1, 1, wp.transpose(jwa) * own * jwa)
-        h = put(h, 2, 2, wp.transpose(jeb) * own * jeb)
-        h = put(h, 2, 3, wp.transpose(jeb) * own * jwb)
-        h = put(h, 3, 3, wp.transpose(jwb) * own * jwb)
-        h = put(h, 0, 2, wp.transpose(jea) * wp.transpose(cross) * jeb)
-        h = put(h, 0, 3, wp.transpose(jea) * wp.transpose(cross) * jwb)
-        h = put(h, 1, 2, wp.transpose(jwa) * wp.transpose(cross) * jeb)
-        h = put(h, 1, 3, wp.transpose(jwa) * wp.transpose(cross) * jwb)
+        # of e_a, w_a, e_b and w_b
+        h00 = wp.transpose(jea) * own * jea
+        h01 = wp.transpose(jea) * own * jwa
+        h11 = wp.transpose(jwa) * own * jwa
+        h22 = wp.transpose(jeb) * own * jeb
+        h23 = wp.transpose(jeb) * own * jwb
+        h33 = wp.transpose(jwb) * own * jwb
+        h02 = wp.transpose(jea) * wp.transpose(cross) * jeb
+        h03 = wp.transpose(jea) * wp.transpose(cross) * jwb
+        h12 = wp.transpose(jwa) * wp.transpose(cross) * jeb
+        h13 = wp.transpose(jwa) * wp.transpose(cross) * jwb
         if project[0] == 0:
             torque = axial(n)
             ee, ew, ww = bent(a, -torque)
-            h += put(put(put(mat12(), 0, 0, ee), 0, 1, ew), 1, 1, ww)
+            h00 += ee
+            h01 += ew
+            h11 += ww
             ee, ew, ww = bent(b, torque)
-            h += put(put(put(mat12(), 2, 2, ee), 2, 3, ew), 3, 3, ww)
-        for r in range(12):
-            for k in range(r):
-                h[r, k] = h[k, r]
+            h22 += ee
+            h23 += ew
+            h33 += ww
         # e_a, w_a, e_b, w_b of the five corners
         of = table(
             -one, one, zero, zero, zero,
@@ -275,18 +285,18 @@ def kernels(real: Real) -> SimpleNamespace:
             zero, -one, one, zero, zero,
             zero, -half, -half, zero, one,
         )  # fmt: skip
-        at = offset + wp.static(BLOCKS) * i
-        for p in range(wp.static(CORNERS)):
-            for q in range(p, wp.static(CORNERS)):
-                block = mat33()
-                for r in range(3):
-                    for k in range(3):
-                        total = wide(0.0)
-                        for s in range(4):
-                            for m in range(4):
-                                total += of[s, p] * of[m, q] * h[3 * s + r, 3 * m + k]
-                        block[r, k] = scalar(total)
-                blocks_out[at] = block
-                at += 1
+        begin = offset + wp.static(BLOCKS) * i
+        p, q = int(0), int(0)
+        for at in range(begin, begin + wp.static(BLOCKS)):  # not unrolled: fifteen times this takes long to compile
+            to = wide4(of[0, q], of[1, q], of[2, q], of[3, q])
+            total = plus(wide33(), of[0, p], to, mirrored(h00), h01, h02, h03)
+            total = plus(total, of[1, p], to, wp.transpose(h01), mirrored(h11), h12, h13)
+            total = plus(total, of[2, p], to, wp.transpose(h02), wp.transpose(h12), mirrored(h22), h23)
+            total = plus(total, of[3, p], to, wp.transpose(h03), wp.transpose(h13), wp.transpose(h23), mirrored(h33))
+            blocks_out[at] = edges.narrowed(total)
+            q += 1
+            if q == wp.static(CORNERS):
+                p += 1
+                q = p
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
