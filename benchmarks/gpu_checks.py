@@ -384,17 +384,14 @@ def prepare(folder: Path, arch: int | None, small: bool, parts: str) -> None:
 
 def compile_kernels(folder: Path, arch: int, precisions_of: tuple[str, ...] = PRECISIONS) -> None:
     """Every kernel of the package, to machine code for `arch`, into a cache that WARP_CACHE_PATH may name on another machine."""
-    from tests.linear.test_cuda_code import FACTORIES as LINEAR
-    from tests.test_cuda_code import FACTORIES
+    from tests.factories import LINEAR, STEP, modules
 
     cache, start, total = folder.resolve() / wp.config.version, time.perf_counter(), 0
-    modules = {}
+    found = {}
     for precision in precisions_of:
-        for make in (*FACTORIES.values(), *LINEAR.values()):
-            made = make(real(precision))
-            kernels = (made if isinstance(made, dict) else vars(made)).values()
-            modules |= {kernel.module.name: kernel.module for kernel in kernels if isinstance(kernel, wp.Kernel)}
-    for module in modules.values():
+        for make in (*STEP.values(), *LINEAR.values()):
+            found |= {module.name: module for module in modules(make(real(precision)))}
+    for module in found.values():
         place = cache / module.get_module_identifier()
         if not place.exists():
             wp.compile_aot_module(module, arch=arch, use_ptx=False, module_dir=place)
@@ -402,4 +399,4 @@ def compile_kernels(folder: Path, arch: int, precisions_of: tuple[str, ...] = PR
                 source.unlink()
             print(f"{place.name}: {time.perf_counter() - start:.0f} s", flush=True)
         total += sum(os.path.getsize(each) for each in place.iterdir())
-    print(f"{cache}: {len(modules)} modules, {total / 1e6:.1f} MB, {time.perf_counter() - start:.0f} s")
+    print(f"{cache}: {len(found)} modules, {total / 1e6:.1f} MB, {time.perf_counter() - start:.0f} s")

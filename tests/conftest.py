@@ -1,4 +1,6 @@
-"""Before a whole run on several workers, each compiles its part of the kernels, which otherwise all of them would compile at once."""
+"""A run on several workers shares the machine between them: each has its part of the cores, and before a whole run each compiles its part
+of the kernels, which otherwise all of them would compile at once.
+"""
 
 import os
 import sys
@@ -6,14 +8,18 @@ from pathlib import Path
 
 import pytest
 
+from pdipc.device import threads
+
 sys.path.insert(0, str(Path(__file__).parent))
 WHOLE = 1000  # tests, about half of all
+WORKER, WORKERS = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if WORKERS > 1:  # tests of threads say how many they want
+    os.environ.setdefault("PDIPC_THREADS", str(max(1, threads.thread_count() // WORKERS)))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Loads what this worker is to compile; what is in Warp's cache already takes no time."""
-    name, count = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    if count == 1 or len(session.items) < WHOLE:
+    """Loads what this worker is to compile; what is in Warp's cache already takes no time. Tests begin when all workers have."""
+    if WORKERS == 1 or len(session.items) < WHOLE:
         return
     import factories
 
@@ -21,5 +27,5 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
     made = [factory(real("float64")) for factory in factories.ON_CPU.values()]  # of float32 not all is used
     modules = list(dict.fromkeys(module for each in made for module in sorted(factories.modules(each), key=lambda m: m.name)))
-    for module in modules[int(name.removeprefix("gw")) :: count]:
+    for module in modules[int(WORKER.removeprefix("gw")) :: WORKERS]:
         module.load("cpu", block_dim=1)

@@ -11,15 +11,16 @@ import warp as wp
 COMMAND = [sys.executable, str(Path(__file__).parents[1] / "benchmarks" / "gpu.py")]
 
 
-def test_the_command_on_the_cpu(tmp_path):
+def test_the_command_on_the_cpu(tmp_path, monkeypatch):
     """References and kernels prepared beforehand, then all checks and a few of the times on small cases."""
-    carried = ["--case", "box_stack float64", "--small"]
-    done = subprocess.run([*COMMAND, "--prepare", tmp_path, *carried], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.syspath_prepend(str(Path(COMMAND[1]).parent))
+    import gpu
+
+    folder = str(tmp_path)
+    assert gpu.main(["--prepare", folder, "--case", "box_stack float64", "--small"]) == 0
     parts = ["scenes", "kernels", "ccd", "worlds", "peer scenes"]
-    command = [*COMMAND, "--device", "cpu", "--small", "--jobs", "1", "-o", tmp_path, "--carried", tmp_path, "--only", *parts]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    small = ["--device", "cpu", "--small", "--jobs", "1"]
+    assert gpu.main([*small, "-o", folder, "--carried", folder, "--only", *parts]) == 0
     found = json.loads((tmp_path / "gpu.json").read_text())
     assert found["ok"]
     results = found["results"]
@@ -29,6 +30,23 @@ def test_the_command_on_the_cpu(tmp_path):
     assert all(check["passed"] and check["found"] <= check["limit"] for check in checks)
     assert set(parts) == {line["part"] for line in results if "ended" in line}
     assert next(line for line in results if line["case"] == "s2_2" and "steps" in line)["steps"] > 0
+
+
+def test_kernels_are_compiled_beforehand(tmp_path, monkeypatch):
+    """Into a cache as Warp names it, for the architecture that was asked for; once."""
+    monkeypatch.syspath_prepend(str(Path(COMMAND[1]).parent))
+    import gpu
+
+    from tests import factories
+
+    monkeypatch.setattr(factories, "STEP", {"forces": factories.STEP["forces"]})
+    monkeypatch.setattr(factories, "LINEAR", {})
+    for _ in range(2):
+        gpu.checks.compile_kernels(tmp_path, 90, ("float32",))
+        (folder,) = (tmp_path / wp.config.version).iterdir()
+        assert "loads.float32" in folder.name
+        (binary,) = folder.glob("*.sm90.cubin")
+        assert binary.stat().st_size > 1000
 
 
 def test_what_breaks_costs_nothing_else(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 PART = 1 << 17  # pairs, and places where pairs may be, that are looked at together
+FEW = 1 << 16  # pairs; so many are sooner compared than sorted into grids
 
 
 def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.ndarray) -> np.ndarray:
@@ -19,7 +20,7 @@ def overlapping(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b
 def parts(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.ndarray) -> Iterator[np.ndarray]:
     """What `overlapping` returns, in parts of about PART pairs at most, so that memory does not grow with their number.
 
-    A hierarchy of grids: each box lives in the grid whose cells are just larger than it, so that it touches at most eight; a pair meets
+    Few boxes are compared each with each. For more, a hierarchy of grids: each box lives in the grid whose cells are just larger than it, so that it touches at most eight; a pair meets
     in the coarser grid of the two.
 
     Exact: corners are only compared. Cell numbers round, but are monotone in the coordinate: the greater of two low corners, in each
@@ -30,6 +31,9 @@ def parts(low_a: np.ndarray, high_a: np.ndarray, low_b: np.ndarray, high_b: np.n
     if len(low_a) == 0 or len(low_b) == 0:
         return
     low_a, high_a, low_b, high_b = (np.asarray(corner, dtype=np.float64) for corner in (low_a, high_a, low_b, high_b))
+    if len(low_a) * len(low_b) <= FEW:
+        yield np.argwhere(np.all((low_a[:, None] <= high_b) & (low_b <= high_a[:, None]), axis=2))
+        return
     origin = np.minimum(low_a.min(axis=0), low_b.min(axis=0))
     extent = max(high_a.max(axis=0).max(), high_b.max(axis=0).max()) - origin.min()
     finest = max(extent * 2.0**-18, np.finfo(np.float64).tiny)  # so that three cell numbers fit into one key
