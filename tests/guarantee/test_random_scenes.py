@@ -6,7 +6,7 @@ Some steps are cut short after a few outer iterations: a state that has not conv
 import ipctk
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, seed, settings
+from hypothesis import HealthCheck, Phase, assume, given, seed, settings
 from hypothesis import strategies as st
 from physics.scenes import cloth, floor, scene, solid, watched
 
@@ -74,7 +74,12 @@ def judged(random_scene) -> list[pdipc.StepResult]:
 
 def examples(count: int, number: int):
     """Decorator: a function is called with so many random examples, the same ones each time."""
-    of = settings(max_examples=count, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    once = {
+        "database": None,
+        "phases": [Phase.generate],
+        "deadline": None,
+    }  # what fails is told as it is: to shrink it takes minutes
+    of = settings(max_examples=count, suppress_health_check=list(HealthCheck), **once)
     return lambda function: seed(number)(of(function))
 
 
