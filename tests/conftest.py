@@ -14,7 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 WHOLE = 1000  # tests, about half of all
 WORKER, WORKERS = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if WORKERS > 1:  # tests of threads say how many they want
-    os.environ.setdefault("PDIPC_THREADS", str(max(1, threads.thread_count() // WORKERS)))
+    share = str(max(1, threads.thread_count() // WORKERS))
+    for name in ("PDIPC_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, share)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
