@@ -18,7 +18,7 @@ from pdipc.simulation import run_scene
 STEPS = 3
 PARTS, OF_A_PART = 8, 25  # random scenes
 UNCONVERGED = 4  # steps of the 75 of a part, at most
-CUT, OF_CUT = 3, 20  # outer iterations after which steps are cut short, and scenes
+CUT, OF_CUT = 2, 20  # outer iterations after which steps are cut short, and scenes
 
 coordinate = st.floats(-0.3, 0.3)
 angle = st.floats(0.0, 90.0)
@@ -109,7 +109,7 @@ def test_nothing_intersects_where_steps_are_cut_short():
         outcomes.extend(result.converged for result in judged(random_scene))
 
     holds()
-    assert outcomes.count(False) > len(outcomes) // 4
+    assert outcomes.count(False) > len(outcomes) // 2  # they are cut short indeed
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
