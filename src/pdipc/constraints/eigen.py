@@ -93,6 +93,15 @@ def functions(real: Real) -> SimpleNamespace:
             and a[2, 2] >= wp.abs(a[0, 2]) + wp.abs(a[1, 2])
         ):
             return a
+        # and so is one whose leading minors are positive beyond doubt (Sylvester)
+        size = wp.max(wp.max(wp.abs(a[0, 0]), wp.abs(a[1, 1])), wp.abs(a[2, 2]))
+        doubt = scalar(32.0) * rounding * size
+        minor = a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]
+        third = a[2, 2] * minor - (
+            a[1, 1] * a[0, 2] * a[0, 2] + a[0, 0] * a[1, 2] * a[1, 2] - scalar(2.0) * a[0, 1] * a[0, 2] * a[1, 2]
+        )
+        if a[0, 0] > doubt and minor > doubt * size and third > doubt * size * size:
+            return a
         s, v = symmetric(a)
         if s[0] >= zero and s[1] >= zero and s[2] >= zero:
             return a

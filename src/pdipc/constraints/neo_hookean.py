@@ -31,8 +31,8 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, mu, lame) -> Constrai
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    """stress, principal and density, over mu; the argument `lame` is lambda / mu."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    """stress, principal, invariants and density, over mu; the argument `lame` is lambda / mu."""
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     one, half = wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
     m, shift = wp.constant(scalar(4.0 / 3.0)), wp.constant(scalar(5.0 / 6.0))
     cofactor = rotation.functions(real).cofactor
@@ -61,6 +61,12 @@ def functions(real: Real) -> SimpleNamespace:
         return stretch, each + side, each - side
 
     @wp.func
+    def invariants(f: mat33, mu: scalar, lame: scalar) -> vec4:
+        k = lame + shift * mu
+        fade = one / (wp.ddot(f, f) + one)
+        return vec4(m * mu * (one - fade), scalar(2.0) * m * mu * fade * fade, k, k * (wp.determinant(f) - one) - mu)
+
+    @wp.func
     def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
         """All terms of first order cancel at rest, and are left out where J > 0, since of them rounding of mu would be left: in terms of
         C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.
@@ -81,10 +87,12 @@ def functions(real: Real) -> SimpleNamespace:
             bent = y * (one - wp.log(w) / (w - one))
         return mu * shear + half * m * mu * bent + half * (lame + shift * mu) * j * j
 
-    return SimpleNamespace(stress=stress, principal=principal, density=density)
+    return SimpleNamespace(stress=stress, principal=principal, invariants=invariants, density=density)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    wide = functions(real_of("float64"))
-    return tets.kernels(real, real.module(__name__), wide.stress, functions(real).principal, wide.density)
+    wide, own = functions(real_of("float64")), functions(real)
+    # in single precision the terms of the invariants leave more of a rigid rotation than inertia bears; see `tests.linear.test_blocks`
+    invariants = own.invariants if real.name == "float64" else None
+    return tets.kernels(real, real.module(__name__), wide.stress, own.principal, wide.density, invariants)

@@ -8,6 +8,12 @@ energy's second derivative in terms of the signed singular values s of F = U dia
 Eigensystems for Isotropic Distortion Energies): the 3x3 matrix W_ij over the stretches, and for each pair of axes, named by the
 third, what twisting them costs, (W_i + W_j) / (s_i + s_j), and flipping them, (W_i - W_j) / (s_i - s_j). These are the eigenvalues:
 projection sets the negative ones to zero.
+
+A kind whose energy is a function of |F|^2 and J = det F alone may bring `invariants(F, mu, lame)`, too: the factors a, b, c, d of
+
+    d^2 W = a |dF|^2 + b (F : dF)^2 + c (dJ)^2 + d d^2 J,
+
+from which the Hessian follows without singular values where it is not projected.
 """
 
 import functools
@@ -59,9 +65,10 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """Deformation gradients, and blocks of the Hessian."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
     eig, rot = eigen.functions(real), rotation.functions(real)
+    zero = wp.constant(scalar(0.0))
 
     @wp.func
     def edge(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), a: int, b: int) -> vec3:
@@ -121,7 +128,19 @@ def functions(real: Real) -> SimpleNamespace:
             stretch[2, 2] * a[2] * b[2] + p[1] * a[0] * b[0] + p[0] * a[1] * b[1],
         )  # fmt: skip
 
+    @wp.func
+    def skew(a: vec3) -> mat33:
+        return mat33(zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero)
+
+    @wp.func
+    def plain_block(i: vec4, f: mat33, cofactors: mat33, a: vec3, b: vec3) -> mat33:
+        """The same from the factors `i` of the invariants, in the scene's axes: d^2 J = det(dx_a, dx_b, F (a x b))."""
+        outer = i[1] * wp.outer(f * a, f * b) + i[2] * wp.outer(cofactors * a, cofactors * b)
+        return i[0] * wp.dot(a, b) * wp.identity(n=3, dtype=scalar) + outer - i[3] * skew(f * wp.cross(a, b))
+
     return SimpleNamespace(
+        cofactor=rot.cofactor,
+        plain_block=plain_block,
         edge=edge,
         wide_edge=wide_edge,
         deformation=deformation,
@@ -133,11 +152,14 @@ def functions(real: Real) -> SimpleNamespace:
     )
 
 
-def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable, density: Callable) -> SimpleNamespace:
+def kernels(
+    real: Real, module: wp.Module, stress: Callable, principal: Callable, density: Callable, invariants: Callable | None = None
+) -> SimpleNamespace:
     """Force, energy and Hessian of tets. stress, and density(F, mu, lame), the energy over the weight: in double precision."""
     scalar, vec2, vec3, mat33 = real.scalar, real.vec2, real.vec3, real.mat33
     f_of, eig = functions(real), eigen.functions(real)
     half, zero, wide = wp.constant(scalar(0.5)), wp.constant(scalar(0.0)), wp.float64
+    plain = invariants
 
     @named(module, "force")
     def force(
@@ -197,9 +219,26 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
         """The blocks of corners a < b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         b = inverse[e]
-        s, turn, axes = f_of.singular_values(f_of.deformation(base, u, vertices[e], b))
-        stretch, twist, flip = principal(s, modulus[e][0], modulus[e][1])
+        f = f_of.deformation(base, u, vertices[e], b)
         w = weight[e]
+        at = offset + 10 * e
+        if wp.static(invariants is not None):  # noqa: SIM102  (Warp compiles neither otherwise)
+            if project[0] == 0:
+                i = w * plain(f, modulus[e][0], modulus[e][1])
+                c = f_of.cofactor(f)
+                b1 = vec3(b[0, 0], b[0, 1], b[0, 2])
+                b2 = vec3(b[1, 0], b[1, 1], b[1, 2])
+                b3 = vec3(b[2, 0], b[2, 1], b[2, 2])
+                b0 = -(b1 + b2 + b3)
+                blocks_out[at + 1] = f_of.plain_block(i, f, c, b0, b1)
+                blocks_out[at + 2] = f_of.plain_block(i, f, c, b0, b2)
+                blocks_out[at + 3] = f_of.plain_block(i, f, c, b0, b3)
+                blocks_out[at + 5] = f_of.plain_block(i, f, c, b1, b2)
+                blocks_out[at + 6] = f_of.plain_block(i, f, c, b1, b3)
+                blocks_out[at + 8] = f_of.plain_block(i, f, c, b2, b3)
+                return
+        s, turn, axes = f_of.singular_values(f)
+        stretch, twist, flip = principal(s, modulus[e][0], modulus[e][1])
         if project[0] != 0:
             stretch = eig.positive_part(stretch)
             for k in range(3):
@@ -217,7 +256,6 @@ def kernels(real: Real, module: wp.Module, stress: Callable, principal: Callable
         g3 = vec3(g[2, 0], g[2, 1], g[2, 2])
         g0 = -(g1 + g2 + g3)
         back = wp.transpose(turn)
-        at = offset + 10 * e
         blocks_out[at + 1] = turn * f_of.block(stretch, p, q, g0, g1) * back
         blocks_out[at + 2] = turn * f_of.block(stretch, p, q, g0, g2) * back
         blocks_out[at + 3] = turn * f_of.block(stretch, p, q, g0, g3) * back
