@@ -13,7 +13,7 @@ from pdipc.judge.exact import Motion, nearest, stays_apart_exactly
 
 __all__ = ["candidates", "differences", "distance_squared", "stays_apart", "stays_apart_exactly"]
 
-LEVELS, MOST = 25, 500  # halvings, and intervals of one query, before whole numbers take over
+LEVELS, MOST = 60, 500  # halvings, and intervals of one query, before whole numbers take over
 MARGIN = 32  # roundings (of numbers above one) that a proof leaves room for
 
 
