@@ -414,10 +414,35 @@ def test_damaged_topologies_are_named(tmp_path, change, said):
 
 def test_damaged_frames_are_named(tmp_path):
     runs.write(tmp_path / "run", steps=1)
-    for array, said in ((np.zeros((2, 3)), r"float64 of shape \(2, 3\)"), (np.array(["a"]), "must hold floating-point")):
+    whole = open_run(tmp_path / "run").positions(1)
+    for array, said in (
+        (np.zeros((2, 3)), r"float64 of shape \(2, 3\)"),
+        (np.array(["a"]), "must hold floating-point"),
+        (np.where(np.arange(len(whole))[:, None] == 5, np.nan, whole), r"000001\.npy: vertex 5 is at \[nan, nan, nan\]"),
+    ):
         np.save(tmp_path / "run/frames/000001.npy", array)
         with pytest.raises(RunError, match=said):
             open_run(tmp_path / "run").positions(1)
+
+
+def test_frames_without_a_line_and_lines_without_a_frame(tmp_path):
+    folder = tmp_path / "run"
+    writer, state = runs.begin(folder)
+    with writer:
+        for step in range(1, 4):
+            writer.append(step, step * 0.01, state, {})
+        writer.checkpoint(3, {"positions": state})
+    lines = (folder / "stats.jsonl").read_text().splitlines(keepends=True)
+    (folder / "stats.jsonl").write_text("".join(lines[:2] + lines[3:]))
+    for read in (open_run, RunWriter.resume):
+        with pytest.raises(RunError, match=r"stats\.jsonl has no line for 000002\.npy"):
+            read(folder)
+    (folder / "stats.jsonl").write_text("".join(lines))
+    (folder / "frames/000002.npy").unlink()
+    with pytest.raises(RunError, match=r"000002\.npy cannot be read"):
+        open_run(folder).positions(2)
+    with pytest.raises(RunError, match=r"000002\.npy is not there"):
+        RunWriter.resume(folder)
 
 
 def test_more_than_a_million_steps(tmp_path):

@@ -121,6 +121,9 @@ class RunWriter:
             last = -1 if checkpoint is None else checkpoint[0]
             with _room(run.folder):
                 kept = [record for record in run.records if record["step"] <= last]
+                for record in kept:
+                    if not _frame(run.folder, record["step"]).is_file():
+                        raise RunError(f"{_frame(run.folder, record['step'])} is not there; start again with --overwrite")
                 _write_text(run.folder / "stats.jsonl", "".join(_line(record) for record in kept))
                 for path in [*run.folder.glob("*.tmp"), *run.folder.glob("*/*.tmp")]:
                     _remove(path)
@@ -161,7 +164,7 @@ class RunWriter:
         single = positions.astype(np.float32)
         lossless = np.array_equal(single.astype(np.float64), positions)  # what a float32 simulation gives
         with _room(self.folder):
-            _write(self.folder / "frames" / f"{step:06d}.npy", lambda file: np.save(file, single if lossless else positions))
+            _write(_frame(self.folder, step), lambda file: np.save(file, single if lossless else positions))
             if forces is not None:
                 (self.folder / "forces").mkdir(exist_ok=True)
                 _write_arrays(self.folder / "forces" / f"{step:06d}.npz", forces)
@@ -183,7 +186,7 @@ class RunWriter:
         from pdipc.output import vtkhdf
 
         times = np.array([time for _, time in self.frames])
-        paths = [self.folder / "frames" / f"{step:06d}.npy" for step, _ in self.frames]
+        paths = [_frame(self.folder, step) for step, _ in self.frames]
         with _room(self.folder):
             vtkhdf.update(self.folder / "run.vtkhdf", self.topology, self.real, times, paths)
 
@@ -215,6 +218,11 @@ def _latest_checkpoint(run: "Run") -> tuple[int, dict[str, np.ndarray]] | None:
         except UNREADABLE:
             continue
     return None
+
+
+def _frame(folder: Path, step: int) -> Path:
+    """The file of the frame after a step."""
+    return folder / "frames" / f"{step:06d}.npy"
 
 
 def _step_of(path: Path) -> int:
@@ -250,6 +258,11 @@ class Run:
         self.scene: dict[str, Any] = _read_json(folder / "scene.json")
         self.topology = _read_topology(folder / "topology.npz")
         self.records = _read_records(folder / "stats.jsonl")
+        told = {record["step"] for record in self.records}
+        lost = [path for path in sorted((folder / "frames").glob("*.npy")) if -1 < _step_of(path) < max(told, default=0)]
+        lost = [path for path in lost if _step_of(path) not in told]
+        if lost:
+            raise RunError(f"{folder / 'stats.jsonl'} has no line for {lost[0].name}, and lines for what comes after it")
 
     @property
     def frame_count(self) -> int:
@@ -272,7 +285,7 @@ class Run:
             record = self.records[frame]
         except IndexError:
             raise IndexError(f"{self.folder} has no frame {frame}; it has {self.frame_count} frames") from None
-        path = self.folder / "frames" / f"{record['step']:06d}.npy"
+        path = _frame(self.folder, record["step"])
         try:
             found = np.load(path)
         except UNREADABLE as error:
@@ -282,6 +295,9 @@ class Run:
             raise RunError(
                 f"{path} holds {found.dtype} of shape {found.shape}; it must hold floating-point numbers of shape {right}"
             )
+        wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
+        if len(wrong):
+            raise RunError(f"{path}: vertex {wrong[0]} is at {found[wrong[0]].tolist()}; it must be finite")
         return found.astype(np.float64)
 
     def quarantined(self, frame: int) -> list[tuple[int, int]]:
