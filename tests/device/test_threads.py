@@ -202,4 +202,5 @@ def test_importing_and_counting_needs_no_linux():
         "[delattr(os, name) for name in ('fork', 'register_at_fork', 'sched_getaffinity') if hasattr(os, name)]; "
         "from pdipc.device.launch import Device; assert Device('cpu').threads >= 1"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    counting = {name: value for name, value in os.environ.items() if name != "PDIPC_THREADS"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=counting)

@@ -110,8 +110,9 @@ def test_recording_allocates_nothing(monkeypatch):
     assert allocated == []
 
 
-def test_simulations_in_several_threads_take_turns():
+def test_simulations_in_several_threads_take_turns(monkeypatch):
     """Warp records whatever any thread launches: without turns, one simulation's step would become part of another's."""
+    monkeypatch.setenv("PDIPC_THREADS", "2")
 
     def positions(_=None):
         block = solid("block", (0.2, 0.2, 0.2), (2, 2, 2), at=(0, 0.103, 0), velocity=(0, -1, 0))
