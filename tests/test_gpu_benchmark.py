@@ -8,28 +8,40 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from pdipc.device.launch import Device
+
 COMMAND = [sys.executable, str(Path(__file__).parents[1] / "benchmarks" / "gpu.py")]
 
 
-def test_the_command_on_the_cpu(tmp_path, monkeypatch):
-    """References and kernels prepared beforehand, then all checks and a few of the times on small cases."""
+def test_all_checks_on_the_cpu(tmp_path, monkeypatch):
+    """References prepared beforehand, then all checks and a few of the times on small cases."""
     monkeypatch.syspath_prepend(str(Path(COMMAND[1]).parent))
     import gpu
 
-    folder = str(tmp_path)
-    assert gpu.main(["--prepare", folder, "--case", "box_stack float64", "--small"]) == 0
-    parts = ["scenes", "kernels", "ccd", "worlds", "peer scenes"]
-    small = ["--device", "cpu", "--small", "--jobs", "1"]
-    assert gpu.main([*small, "-o", folder, "--carried", folder, "--only", *parts]) == 0
+    assert gpu.main(["--prepare", str(tmp_path), "--case", "box_stack float64", "--small"]) == 0
+    lines, place = tmp_path / "gpu.jsonl", Device("cpu")
+    for name in ("scenes", "kernels", "ccd", "worlds", "peer scenes"):
+        part = gpu.PARTS[name]
+        for case in part.cases(True):
+            part.run(gpu.Report(lines, name, case, 60.0), place, case, tmp_path)
+    results = gpu.read(lines)
+    checks = [line for line in results if "check" in line]
+    assert len(checks) > 60
+    assert all(check["passed"] and check["found"] <= check["limit"] for check in checks)
+    assert next(line for line in results if line["case"] == "s2_2" and "steps" in line)["steps"] > 0
+
+
+def test_the_command_on_the_cpu(tmp_path):
+    """In processes of its own: one part, whose references it makes."""
+    options = ["--device", "cpu", "--small", "--jobs", "1", "-o", tmp_path, "--only", "ccd"]
+    done = subprocess.run([*COMMAND, *options], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads((tmp_path / "gpu.json").read_text())
     assert found["ok"]
     results = found["results"]
     assert results == [line for line in map(json.loads, (tmp_path / "gpu.jsonl").open()) if "begun" not in line]
-    checks = [line for line in results if "check" in line]
-    assert len(checks) > 60
-    assert all(check["passed"] and check["found"] <= check["limit"] for check in checks)
-    assert set(parts) == {line["part"] for line in results if "ended" in line}
-    assert next(line for line in results if line["case"] == "s2_2" and "steps" in line)["steps"] > 0
+    assert [line["case"] for line in results if "ended" in line] == ["float32", "float64"]
+    assert sum("check" in line for line in results) == 12
 
 
 def test_kernels_are_compiled_beforehand(tmp_path, monkeypatch):
