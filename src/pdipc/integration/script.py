@@ -38,7 +38,7 @@ from pdipc.scene.movers import MOST, Mover, movers_of
 
 CATCH_UP = 2.0  # times the script's pace
 TRIES = 24  # outer iterations in which a mover goes on to one waypoint
-PATIENCE = 0.5  # of the cap of outer iterations
+PATIENCE = 0.7  # of the cap of outer iterations
 AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
 
 
