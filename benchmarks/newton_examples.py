@@ -38,6 +38,8 @@ EXAMPLES = {
     ),
     "cloth_bending": ("cloth", [("pos=wp.vec3(0.0, 0.0, 10.0)", "pos=wp.vec3(0.0, 0.0, 3.0)")], []),
     "cloth_twist": ("cloth", [], []),
+    "softbody_gift": ("multiphysics", [("self.base_height = 20.0", "self.base_height = 2.0")], []),
+    "softbody_dropping_to_cloth": ("multiphysics", [("pos=wp.vec3(0.0, 0.0, 2.0)", "pos=wp.vec3(0.0, 0.0, 1.3)")], []),
 }
 SIDES = ("SolverVBD", "pdipc", "pdipc, 1 step")
 AXES = [0, 2, 1]  # pictures have y up, Newton z
@@ -227,11 +229,18 @@ def main() -> None:
     if options.side:
         run_side(options.examples[0], options.side, options.frames, options.seconds, options.out)
         return
+    os.environ.setdefault("PDIPC_THREADS", "1")  # as many as Warp's launches take on the CPU
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / "newton_examples.json"
-    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "threads": os.environ.get("PDIPC_THREADS")}
-    rows: list[dict] = json.loads(path.read_text())["rows"] if path.exists() else []
-    rows = [row for row in rows if row["example"] not in options.examples]
+    info = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    machine = {
+        "machine": next((line.split(":")[1].strip() for line in info if "model name" in line), platform.processor()),
+        "cores": os.cpu_count(),
+        "threads": os.environ["PDIPC_THREADS"],
+        "date": time.strftime("%Y-%m-%d"),
+        "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent).stdout.strip(),
+    }
+    rows: list[dict] = []
     for name in options.examples:
         with tempfile.TemporaryDirectory() as place:
             sides = {}

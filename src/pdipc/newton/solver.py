@@ -146,6 +146,9 @@ class SolverPDIPC(SolverBase):
         self._simulations, self._now = {}, None
         self._translate(self._q, self._body_q)
 
+    def rebuild_bvh(self, state: newton.State) -> None:
+        """Nothing: SolverVBD has it and programs call it; what finds contacts here is kept up to date within the step."""
+
     # --- between the two ---
 
     def _translate(self, q: np.ndarray | None = None, body_q: np.ndarray | None = None) -> None:
