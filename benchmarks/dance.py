@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import pdipc
+from pdipc.judge.witness import Watch
 from pdipc.output.results import RunWriter
 from pdipc.scene.generators import Capsule
 from pdipc.simulation import stats_of
@@ -80,21 +81,15 @@ def posed(skirt: dict, body: dict, cache: dict, substeps: int, limit: float | No
 
 
 class Witness:
-    """Counts the outer iterations after which anything intersects; body triangles far from the skirt are left out."""
+    """Counts the outer iterations after which anything intersects; of pairs of triangles of the body, which may meet, there is no list."""
 
     def __init__(self, simulation: pdipc.Simulation):
-        assembly = simulation.model.assembly
-        self.triangles, self.obstacle = simulation.triangles, assembly.obstacle
-        self.of_body = self.obstacle[self.triangles[:, 0]]
+        self.watch = Watch(simulation.triangles, simulation.model.assembly.obstacle)
         self.judged, self.wrong = 0, 0
 
     def __call__(self, x, x_end) -> None:
-        x = x_end.numpy().astype(np.float64)
-        skirt, corners = x[~self.obstacle], x[self.triangles]
-        low, high = skirt.min(axis=0), skirt.max(axis=0)
-        near = ~self.of_body | (np.all(corners.min(axis=1) <= high, axis=1) & np.all(corners.max(axis=1) >= low, axis=1))
         self.judged += 1
-        self.wrong += len(pdipc.find_intersections(x, self.triangles[near], self.obstacle)) > 0
+        self.wrong += len(self.watch(x_end.numpy().astype(np.float64))) > 0
 
 
 def stretches(rest: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> np.ndarray:

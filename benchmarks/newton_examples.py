@@ -238,7 +238,9 @@ def main() -> None:
         "cores": os.cpu_count(),
         "threads": os.environ["PDIPC_THREADS"],
         "date": time.strftime("%Y-%m-%d"),
-        "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent).stdout.strip(),
+        "commit": subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent
+        ).stdout.strip(),
     }
     rows: list[dict] = []
     for name in options.examples:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdipc.judge.witness import find_intersections, segment_meets_triangle
+from pdipc.judge.witness import Watch, find_intersections, segment_meets_triangle
 from pdipc.scene import generators
 from pdipc.scene.motion import rotation_matrix
 
@@ -136,6 +136,24 @@ def test_agrees_with_ipctk(seed, spread):
     triangles = np.arange(18).reshape(-1, 3)
     mesh = ipctk.CollisionMesh(positions, ipctk.edges(triangles), triangles)
     assert (len(find_intersections(positions, triangles)) > 0) == ipctk.has_intersections(mesh, positions)
+
+
+def test_a_watch_finds_what_the_witness_finds():
+    """Two sheets, the upper of an obstacle, that approach in steps smaller and larger than the margin, cross and part; ripples make each fold."""
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    a = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    sheet = np.concatenate([np.stack([a, a + 12, a + 13], 1), np.stack([a, a + 13, a + 1], 1)])
+    triangles = np.concatenate([sheet, sheet + 144, sheet + 288])
+    obstacle = np.arange(432) >= 144  # the two upper ones are, and meet each other
+    watch, found = Watch(triangles, obstacle, margin=0.05), []
+    for gap in (1.0, 0.98, 0.97, 0.5, 0.48, 0.3, 0.28, 0.1, 0.12, 0.9):
+        x = np.concatenate([np.column_stack([grid, np.full(144, z)]) for z in (0.0, gap, gap + 0.01)])
+        x += rng.uniform(-0.2, 0.2, x.shape) * [0.02, 0.02, 1.0] if gap < 0.6 else 0.0
+        expected = find_intersections(x, triangles, obstacle)
+        np.testing.assert_array_equal(watch(x), expected)
+        found.append(len(expected))
+    assert found[:3] == [0, 0, 0] and max(found) > 100 and found[-1] == 0
 
 
 def test_bad_input_is_refused():

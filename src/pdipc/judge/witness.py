@@ -5,7 +5,7 @@ vertex with them. Signs of determinants are taken in floating point where its er
 in integers otherwise, as where something overflows: the verdict is that of exact arithmetic on the numbers given, up to 1e300 m.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -39,8 +39,67 @@ def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: n
     if lowest < 0 or highest >= len(positions):
         raise ValueError(f"triangles use the vertices {lowest} to {highest}; there are 0 to {len(positions) - 1}")
 
-    edges, owner, first = _edges(triangles)
-    crossings = edge_triangle_crossings(positions, edges, triangles)
+    sides = _edges(triangles)
+    return _meeting(positions, triangles, obstacle, sides, edge_triangle_crossings(positions, sides[0], triangles))
+
+
+class Watch:
+    """`find_intersections` for states of one mesh that lie near each other, such as those of a solve, where boxes of edges and triangles are most
+    of the work: they are looked up once, each larger by `margin` m to all sides, and again when a coordinate has changed by more than that since.
+    Until then boxes that overlap are among these.
+    """
+
+    def __init__(self, triangles: np.ndarray, obstacle: np.ndarray | None = None, margin: float = 1e-3):
+        self.triangles = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
+        self.obstacle, self.margin = obstacle, margin
+        self.sides = edges, owner, first = _edges(self.triangles)
+        self.fixed = np.zeros(len(self.triangles), dtype=bool)
+        if obstacle is not None:
+            self.fixed = np.asarray(obstacle)[self.triangles].all(axis=1)
+        self.fixed_edge = np.logical_and.reduceat(self.fixed[owner], first[:-1]) if len(edges) else np.zeros(0, dtype=bool)
+        self.start: np.ndarray | None = None
+
+    def __call__(self, positions: np.ndarray) -> np.ndarray:
+        """What `find_intersections(positions, triangles, obstacle)` returns; positions (n, 3), finite."""
+        edges = self.sides[0]
+        if self.start is None or not np.abs(positions - self.start).max() <= self.margin:
+            self.start, self.near = positions.copy(), self._list(positions)
+        (low, high), (low_t, high_t) = (_bounds(positions, of) for of in (edges, self.triangles))
+        e, t = self.near.T
+        for axis in range(3):
+            kept = (low[e, axis] <= high_t[t, axis]) & (low_t[t, axis] <= high[e, axis])
+            e, t = e[kept], t[kept]
+        crossings = edge_triangle_crossings(positions, edges, self.triangles, [np.column_stack([e, t])])
+        return _meeting(positions, self.triangles, self.obstacle, self.sides, crossings)
+
+    def _list(self, positions: np.ndarray) -> np.ndarray:
+        """(c, 2): edges and triangles that share no vertex, not both of obstacles, whose boxes overlap once they have grown."""
+        edges, triangles = self.sides[0], self.triangles
+        grown = self.margin * (1.0 + 1e-9) + 1e-12 * np.abs(positions).max()  # more than what sums round
+        found = []
+        for of_edges, of_triangles in ((~self.fixed_edge, slice(None)), (self.fixed_edge, ~self.fixed)):
+            e, t = np.flatnonzero(of_edges), np.arange(len(triangles))[of_triangles]
+            if not len(e) or not len(t):
+                continue
+            (low, high), (low_t, high_t) = _bounds(positions, edges[e]), _bounds(positions, triangles[t])
+            low, high, low_t, high_t = low - grown, high + grown, low_t - grown, high_t + grown
+            e_near = np.all((low <= high_t.max(axis=0)) & (high >= low_t.min(axis=0)), axis=1)
+            t_near = np.all((low_t <= high.max(axis=0)) & (high_t >= low.min(axis=0)), axis=1)
+            pairs = boxes.overlapping(low[e_near], high[e_near], low_t[t_near], high_t[t_near])
+            found.append(np.column_stack([e[e_near][pairs[:, 0]], t[t_near][pairs[:, 1]]]))
+        pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *found])
+        return pairs[np.all(edges[pairs[:, 0], :, None] != triangles[pairs[:, 1], None], axis=(1, 2))]
+
+
+def _bounds(positions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corners (m, 3) of the boxes around elements (m, k)."""
+    points = positions[corners]
+    return points.min(axis=1), points.max(axis=1)
+
+
+def _meeting(positions, triangles, obstacle, sides, crossings) -> np.ndarray:
+    """The pairs of triangles that `find_intersections` returns; sides: `_edges(triangles)`; crossings: (c, 2) edges and triangles that meet."""
+    edges, owner, first = sides
     # every triangle that has the edge meets the triangle that the edge meets
     counts = np.diff(first)[crossings[:, 0]]
     rows = np.repeat(np.arange(len(crossings)), counts)
@@ -53,10 +112,15 @@ def find_intersections(positions: np.ndarray, triangles: np.ndarray, obstacle: n
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is in doubt
-def edge_triangle_crossings(positions: np.ndarray, edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(k, 2): edge and triangle that share no vertex and have a point in common."""
+def edge_triangle_crossings(
+    positions: np.ndarray, edges: np.ndarray, triangles: np.ndarray, candidates: Iterable[np.ndarray] | None = None
+) -> np.ndarray:
+    """(k, 2): edge and triangle that share no vertex and have a point in common. candidates: arrays (c, 2) of those whose boxes overlap, where
+    they are known.
+    """
     ends, corners = positions[edges], positions[triangles]
-    candidates = boxes.parts(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
+    if candidates is None:
+        candidates = boxes.parts(*_bounds(positions, edges), *_bounds(positions, triangles))
     a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     normal_sum = _cross_of_magnitudes(u, v)
