@@ -22,7 +22,7 @@ from pdipc.simulation import stats_of
 
 FRAMES, INTERVAL = 60, 0.04  # s
 CLOTH = {"areal_density": 0.22, "membrane_stiffness": 2000.0, "bending_stiffness": 1.3e-4}  # woven trousers, docs/materials.md
-WAIST, NARROW = (0.0, 0.9, -0.02), (0.7, 1.0, 0.7)  # where the skirt goes, m, and its scale
+WAIST, NARROW = (0.0, 0.85, -0.02), (0.7, 1.0, 0.7)  # where the skirt goes, m, and its scale
 
 
 def capsule(a: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

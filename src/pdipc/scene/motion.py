@@ -104,6 +104,8 @@ class Trajectory:
     def apply(self, points: np.ndarray, time: float) -> np.ndarray:
         """(n, 3) points of the start, m, at `time` s."""
         rotation, p = self.pose(time)
+        if np.array_equal(rotation, np.eye(3)):  # what stands still does to the bit
+            return points + p
         return (points - self.center) @ rotation.T + (self.center + p)
 
 
