@@ -136,10 +136,32 @@ def test_sheets_that_cross_along_a_line_that_ends_within_both(degrees):
     assert done.crossings > 20 and max(done.moved.values()) < 0.04
 
 
-def test_sheets_across_each_other_are_left_and_named():
-    crossed = assemble(scene([cloth("a", (0.4, 0.4), (8, 8)), cloth("b", (0.4, 0.4), (8, 8), rotation=(0, 3, 90))]))
-    done = separate(crossed)
-    assert done.left == [("a", "b")]  # more than `limit` away from one side, whichever it is
+def across(depth, pinned=()):
+    """A sheet, and another at right angles to it whose lower edge reaches through it by `depth`, m, in the mean."""
+    sheets = cloth("a", (0.4, 0.4), (8, 8)), cloth("b", (0.4, 0.4), (8, 8), at=(0.01, 0.2 - depth, 0.0), rotation=(0, 3, 90))
+    for sheet in sheets:
+        if sheet["name"] in pinned:
+            sheet["pins"] = [{"select": {"vertices": [0]}}]
+    return scene(sheets)
+
+
+@pytest.mark.parametrize("pinned", ["", "a", "b"])
+def test_sheets_across_each_other_part_as_wholes(pinned):
+    """One moves out of the other, unstrained, by as much as it reaches through; what is pinned stays."""
+    start = assemble(across(0.03, pinned))
+    _, done = judged(across(0.03, pinned))
+    ((name, far),) = done.moved.items()
+    deep = -start.positions[:, 1].min()  # of the lowest corner
+    assert name not in pinned and deep < far < deep + start.activation_distance
+    body = next(body for body in start.bodies if body.name == name)
+    own = slice(body.first, body.last)
+    np.testing.assert_allclose(np.ptp(done.positions[own] - start.positions[own], axis=0), 0.0, atol=1e-12)
+
+
+def test_sheets_across_each_other_are_left_and_named_where_either_way_is_too_far():
+    assert separate(assemble(across(0.2))).left == [("a", "b")]
+    assert separate(assemble(across(0.03, "ab"))).left == [("a", "b")]
+    judged(across(0.2), 0.25)
 
 
 def test_a_skirt_that_starts_in_a_body():

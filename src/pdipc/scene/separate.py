@@ -5,9 +5,12 @@ that lie inside are on the wrong side (generalized winding number, Jacobson et a
 part is on the right side and all others are not (global intersection analysis, Baraff et al. 2003). An edge that cuts nothing off has its nearer end on
 the wrong side. Where that does not separate open surfaces, as where sheets cross along a line, so that neither half is wrong more than the other, or along a line
 that ends within both, which cuts nothing off, they are tried again by their *order*: one sheet is to lie wholly on one side of the other, the one that is
-reached with less motion, and what is over the other on the other side is wrong. A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as
-it may: obstacles and what pins hold exactly do not, solids as a whole first, each other vertex by itself, and displacements spread to its neighbours so
-that elements are strained little.
+reached with less motion, and what is over the other on the other side is wrong. Pairs that neither separates, such as sheets across each other, are tried a
+third time, one body of each moved as a whole before, until a plane lies between the two, where that is within the limit.
+
+A vertex on the wrong side goes to the nearest point of the surface and a gap beyond, and the surface comes to meet it; each side moves as it may:
+obstacles and what pins hold exactly do not, solids as a whole first, each other vertex by itself, and displacements spread to its neighbours so that
+elements are strained little.
 
 Nothing here is trusted: the exact witness says when it is done.
 """
@@ -65,8 +68,9 @@ def separate(assembly: Assembly, limit: float | None = None) -> Separation:
     limit = LIMIT * assembly.body_sizes[1] if limit is None else limit
     found = _Separator(assembly, limit).run()
     if found.left and (again := _Separator(assembly, limit, by_order=True)).orders:
-        ordered = again.run()
-        return min(found, ordered, key=lambda each: len(each.left))
+        found = min(found, again.run(), key=lambda each: len(each.left))
+    if found.left and (again := _Separator(assembly, limit)).shift(found.left):
+        found = min(found, again.run(), key=lambda each: len(each.left))
     return found
 
 
@@ -100,6 +104,29 @@ class _Separator:
             for a, b in np.unique(np.sort(self._owners(crossings), axis=1), axis=0):
                 if a != b and not (self.encloses[a] or self.encloses[b]):
                     self._order(a, b)
+
+    def shift(self, left: list[tuple[str, str]]) -> bool:
+        """Moves bodies that nothing holds as wholes until a plane lies between them and those that they intersect, for the pairs `left` by name:
+        one of each pair, along a principal axis of either, the way that is shortest. Whether any could go within the limit.
+        """
+        bodies, shifted = self.assembly.bodies, False
+        number = {body.name: k for k, body in enumerate(bodies)}
+        for pair in left:
+            a, b = (np.flatnonzero(self.owner == number[name]) for name in pair)
+            axes = np.concatenate(
+                [np.linalg.svd(self.x[own] - self.x[own].mean(axis=0), full_matrices=False)[2] for own in (a, b)]
+            )
+            wanted = self.half[a[0]] + self.half[b[0]] + self.gap
+            ways = []
+            for own, other in ((a, b), (b, a)):
+                for axis in (*axes, *-axes) if np.all(self.weight[own] > 0.0) else ():
+                    length = (self.x[other] @ axis).max() - (self.x[own] @ axis).min() + wanted
+                    ways.append((length, own, self.x[own] + length * axis))
+            if ways and pair[0] != pair[1]:
+                _, own, there = min(ways, key=lambda way: way[0])
+                if np.linalg.norm(there - self.assembly.positions[own], axis=1).max() <= self.limit:
+                    self.x[own], shifted = there, True
+        return shifted
 
     def run(self) -> Separation:
         crossings = self._crossings()
