@@ -111,6 +111,22 @@ def test_two_obstacles_that_close_on_a_cloth_until_they_would_overlap(commanded)
     assert result.lag == 0.0
 
 
+def test_jaws_that_would_overlap_open_again_as_their_script_does():
+    """Each closes to 20 mm beyond the middle, where the other is, and opens: held with the cloth in between, then where the script is."""
+    ways, jaws = [{"time": 0}, {"time": 0.08}, {"time": 0.1}, {"time": 0.18}], []
+    for name, side in (("low", -1.0), ("high", 1.0)):
+        keyframes = [{**key, "translation": [0, y, 0]} for key, y in zip(ways, (0, -0.08 * side, -0.08 * side, 0), strict=True)]
+        jaws.append(box(name, [0.1, 0.05, 0.1], (0, 0.06 * side, 0), motion={"keyframes": keyframes}))
+    sheet = cloth("sheet", (0.2, 0.2), (6, 6), at=(0.01, 0.0, 0.01), rotation=(0, 20, 0))
+    simulation = watched(scene([sheet], jaws, contact=CONTACT, gravity=[0, 0, 0]))
+    lags = []
+    while simulation.state.time < 0.205:
+        lags.append(simulation.step().lag)
+        assert fastest(simulation) < 3.0
+    assert max(lags) > 0.03 and lags[-1] == 0.0
+    np.testing.assert_allclose(simulation.pose("low")[0], [0, -0.06, 0], atol=1e-9)
+
+
 def test_vertices_of_an_obstacle_and_points_of_pins_are_approached():
     sheet = cloth(
         "sheet", (0.2, 0.2), (4, 4), pins=[{"select": {"vertices": [0]}}, {"select": {"vertices": [4]}, "stiffness": 100.0}]

@@ -17,6 +17,14 @@ def test_constant_velocity_and_spin_in_a_window():
     assert path.apply(POINT, 9.0) == pytest.approx(np.array([[0, 1, 3]]), abs=1e-12)
 
 
+def test_what_does_not_turn_keeps_its_bits_but_for_its_way():
+    points, center = np.random.default_rng(5).uniform(-1, 1, (200, 3)), np.array([0.3, -0.7, 0.1])
+    still = Trajectory(None, center)
+    assert still.is_static and np.array_equal(still.apply(points, 0.37), points)
+    sliding = Trajectory(Motion(velocity=(0.25, 0, 0), end=2.0), center)
+    assert np.array_equal(sliding.apply(points, 5.0), points + np.array([0.5, 0, 0]))
+
+
 def test_spin_goes_beyond_a_full_turn_about_a_given_center():
     path = Trajectory(Motion(angular_velocity=(0, 4 * np.pi, 0), center=(2, 0, 0)), np.zeros(3))
     assert path.apply(POINT, 1.0) == pytest.approx(POINT)

@@ -17,7 +17,9 @@ Who waits: a mover that was stopped goes on in every second outer iteration, so 
 is squeezed, and no body that it would push on is held back (`nonlinear.newton`) or was just stopped as a whole, and for at most TRIES times from
 one waypoint to the next; then it is late. Nor does it go on once PATIENCE of all outer iterations that a step may have are over since something came to a
 waypoint: the rest is for what is squeezed to come to rest, so that the step converges for where the mover stands. It follows its script from where it was
-stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again.
+stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again. Where the script itself has come
+back to the pose that it was stopped in, it goes on from there (`returned`): a way that cannot be gone, such as into another obstacle with a cloth in
+between, does not hold it for ever.
 """
 
 import functools
@@ -27,6 +29,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from pdipc.device.launch import Device
@@ -37,6 +40,7 @@ from pdipc.scene.motion import Approach, Deforming, Trajectory
 from pdipc.scene.movers import MOST, Mover, movers_of
 
 CATCH_UP = 2.0  # times the script's pace
+LOOKS, SAMPLES = 4, 256  # times in a step, and in all, at which a late mover looks whether its script has come back
 TRIES = 24  # outer iterations in which a mover goes on to one waypoint
 PATIENCE = 0.7  # of the cap of outer iterations
 AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
@@ -379,7 +383,7 @@ class Script:
             if lead is not None:
                 way = self._led(mover, lead, reached, positions)
             elif mover.rigid and reached.times[mover.body] < time:
-                start = float(reached.times[mover.body])
+                start = returned(mover, path, float(reached.times[mover.body]), time, self.h)
                 last = min(end, start + CATCH_UP * self.h)
                 way = Way(path, start, _waypoints([(mover, path)], start, last))
             else:
@@ -529,6 +533,28 @@ def _towards(now: np.ndarray, goal: np.ndarray, within: float) -> np.ndarray:
     """(k, 3) m: goal, or as far from `now` on the straight ways there as takes nobody further than `within`, m."""
     length = float(np.linalg.norm(goal - now, axis=1).max(initial=0.0))
     return goal if length <= within else now + within / length * (goal - now)
+
+
+def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: float) -> float:
+    """The last time, s, from `stopped` to `now` at which a script's pose is the one at `stopped`, but for the deviation of chords. h: time step, s."""
+    turn, place = path.pose(stopped)
+    reach = mover.reach(path)
+
+    def away(time: float) -> float:
+        """m: as far as any vertex is from its place then, or further."""
+        rotation, p = path.pose(time)
+        return float(np.linalg.norm(p - place) + reach * np.linalg.norm(rotation - turn))
+
+    times = np.linspace(stopped, now, min(SAMPLES, LOOKS * int(np.ceil((now - stopped) / h))) + 1)
+    far = np.array([away(time) for time in times])
+    low = np.flatnonzero((far[1:] <= far[:-1]) & (far[1:] <= np.append(far[2:], np.inf))) + 1
+    for k in low[::-1]:
+        a, b = times[k - 1], times[min(k + 1, len(times) - 1)]
+        nearest = float(minimize_scalar(away, bounds=(a, b), method="bounded", options={"xatol": 1e-9 * h}).x)
+        for time in (times[k], nearest):
+            if away(time) <= mover.deviation:
+                return float(time)
+    return stopped
 
 
 def _waypoints(paths: list, first: float, last: float) -> np.ndarray:
