@@ -60,7 +60,8 @@ def kill_one(folder: Path, killed: list) -> None:
         whole = [path for path in folder.glob("*/frames/000024.npy")]
         for lock in folder.glob("*/run.lock") if len(whole) >= 8 else ():
             words = re.match(r"process (\d+) on", lock.read_text())
-            if words and (lock.parent / "frames" / "000004.npy").exists():
+            done = [(lock.parent / "frames" / name).exists() for name in ("000004.npy", "000024.npy")]
+            if words and done == [True, False]:
                 os.kill(int(words[1]), signal.SIGKILL)
                 killed.append(lock.parent.name)
                 return
