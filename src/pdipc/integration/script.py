@@ -14,7 +14,7 @@ Vertices of a pin turn about each other, not past an obstacle's arcs: they are o
 activation distance.
 
 Who waits: a mover that was stopped goes on in every second outer iteration, so that the others make way in between, as long as no pair of it
-is squeezed, and no body that it would push on is held back (`nonlinear.newton`) or was just stopped as a whole, and for at most TRIES times from
+is squeezed (nor does it set out in a step that starts so), and no body that it would push on is held back (`nonlinear.newton`) or was just stopped as a whole, and for at most TRIES times from
 one waypoint to the next; then it is late. Nor does it go on once PATIENCE of all outer iterations that a step may have are over since something came to a
 waypoint: the rest is for what is squeezed to come to rest, so that the step converges for where the mover stands. It follows its script from where it was
 stopped, by no other way, at CATCH_UP times the script's pace, so that nothing is shot away when the way is free again. Where the script itself has come
@@ -130,6 +130,12 @@ def kernels(real: Real) -> SimpleNamespace:
         i = members[first + wp.tid()]
         if wp.length_sq((target[i] - base[i]) - u[i]) > zero:
             behind_out[mover[i]] = 1
+
+    @wp.kernel(module=module)
+    def hold(first: int, crowded: wp.array(dtype=wp.int32), drive_out: wp.array(dtype=wp.int32)):
+        m = first + wp.tid()
+        if crowded[m] != 0:
+            drive_out[m] = 0
 
     @wp.kernel(module=module)
     def advance(
@@ -508,6 +514,10 @@ class Script:
             self.device.launch_serial(self.kernels.clear, [self.chords])
             self.device.launch(self.kernels.begin, movers, [self.at, self.left, self.tries, self.drive, self.crowded])
             self._aim(x_start)
+
+    def hold(self) -> None:
+        """Whoever would close a pair that is squeezed where the step starts does not set out: it would squeeze it further with each step."""
+        self.device.launch(self.kernels.hold, len(self.movers), [self.crowded, self.drive])
 
     def _aim(self, x_start: wp.array) -> None:
         table = [self.count, self.offset, self.straight, self.center, self.turns, self.places, self.parts]

@@ -328,9 +328,11 @@ def kernels(real: Real) -> SimpleNamespace:
         lagging_out: wp.array(dtype=wp.int32),
         restraint_out: wp.array(dtype=scalar),
         restrained_out: wp.array(dtype=wp.int32),
+        squeezed_out: wp.array(dtype=wp.int32),
     ):
         for b in range(bodies):
             restraint_out[b] = scalar(0.0)
+            squeezed_out[b] = 0
         restrained_out[0] = 0
         lagging_out[0] = FRICTION_LAGS
 
@@ -567,13 +569,26 @@ class Descent:
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        self.device.launch_serial(self.descending.start, [self.bodies, self.lagging, self.restraint, self.restrained])
+        self.device.launch_serial(
+            self.descending.start, [self.bodies, self.lagging, self.restraint, self.restrained, self.squeezed]
+        )
         self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
             self.friction.lag()
         self._evaluate(w.u, w.x)
         self._keep_energies()
+        if w.script.moves:
+            self._find_crowded()
+            w.script.hold()
+
+    def _find_crowded(self) -> None:
+        """Which movers wait, as things are since the potential was evaluated."""
+        w, p = self.work, self.pairs
+        self.device.launch(self.descending.clear, len(w.script.movers), [w.script.crowded])
+        inputs = [p.count, p.quads, self.model.free, p.gaps, p.activation, p.weights, p.normals]
+        inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
+        self.device.launch(self.descending.crowd, p.capacity, [*inputs, self.squeezed, self.restraint, w.script.crowded])
 
     def _evaluate(self, u: wp.array, x: wp.array) -> None:
         """The potential and the forces at x; with friction as it lags."""
@@ -653,12 +668,7 @@ class Descent:
         self.largest.find([self.lags, self.pushes], self.numbers, [status.LAG, status.PUSH])
         self._keep_energies()
         if w.script.moves:
-            p = self.pairs
-            device.launch(k.clear, len(w.script.movers), [w.script.crowded])
-            inputs = [p.count, p.quads, model.free, p.gaps, p.activation, p.weights, p.normals]
-            inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
-            inputs += [self.squeezed, self.restraint, w.script.crowded]
-            device.launch(k.crowd, p.capacity, inputs)
+            self._find_crowded()
         w.script.advance(w.x_start, w.u, t.fraction, w.count)
         s = model.settings
         states = [

@@ -86,6 +86,20 @@ def kernels(real: Real) -> SimpleNamespace:
             u_out[i] = u_end[i]
 
     @wp.kernel(module=module)
+    def stay(
+        first: int,
+        u: wp.array(dtype=vec3),
+        free: wp.array(dtype=scalar),
+        mover: wp.array(dtype=wp.int32),
+        drive: wp.array(dtype=wp.int32),
+        u_tilde_out: wp.array(dtype=vec3),
+    ):
+        """What is scripted and does not set out stays."""
+        i = first + wp.tid()
+        if free[i] == scalar(0.0) and mover[i] >= 0 and drive[wp.max(mover[i], 0)] == 0:
+            u_tilde_out[i] = u[i]
+
+    @wp.kernel(module=module)
     def lead(
         first: int,
         base: wp.array(dtype=vec3),
@@ -107,7 +121,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if drive[wp.max(mover[i], 0)] != 0:
                 u_tilde_out[i] = target[i] - base[i]
 
-    return SimpleNamespace(inertia=inertia, measure=measure, direct=direct, commit=commit, lead=lead)
+    return SimpleNamespace(inertia=inertia, measure=measure, direct=direct, commit=commit, stay=stay, lead=lead)
 
 
 class Iterations:
@@ -237,6 +251,10 @@ class LocalGlobal(Iterations):
         """The predictor, and the potential where the step starts."""
         super().start()
         self.descent.start()
+        w = self.work
+        if w.script.moves:
+            movers = [w.script.mover, w.script.drive]
+            self.device.launch(self.kernels.stay, self.model.vertex_count, [w.u, self.model.free, *movers, w.u_tilde])
 
     def solve(self) -> None:
         """Lines 6 to 12."""
