@@ -28,7 +28,10 @@ from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 
 FRICTION_LAGS = 12  # outer iterations without restraint in which friction's normal forces are renewed; then they stay, so that a limit is reached
-STALE = 2.0  # times what contacts push with now, or the other way round: normal forces that friction does not end with
+STALE, GROSS = (
+    2.0,
+    10.0,
+)  # times what contacts push with now, or the other way round: normal forces that friction does not end with; in a step's second half
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -389,7 +392,7 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.OUTER] = count[status.OUTER] + 1
             count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
-            # what is squeezed pushes far more than it will in the end: friction waits for it, for half of the step at most
+            # friction waits for what is squeezed, for half of the step at most
             if restrained[0] == 0 or 2 * count[status.SINCE] > max_outer:
                 lagging[0] = lagging[0] - 1
             if script[ARRIVED] != 0:
@@ -409,11 +412,12 @@ def kernels(real: Real) -> SimpleNamespace:
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
-            if lagging[0] > 0:
-                numbers[status.PUSH_TAKEN] = numbers[status.PUSH]
-            elif settled and 2 * count[status.SINCE] <= max_outer:
+            if lagging[0] <= 0 and settled:
                 least = wp.min(numbers[status.PUSH], numbers[status.PUSH_TAKEN])
-                if wp.max(numbers[status.PUSH], numbers[status.PUSH_TAKEN]) > scalar(STALE) * least:
+                allowed = scalar(STALE)
+                if 2 * count[status.SINCE] > max_outer:
+                    allowed = scalar(GROSS)
+                if wp.max(numbers[status.PUSH], numbers[status.PUSH_TAKEN]) > allowed * least:
                     lagging[0] = FRICTION_LAGS
                     settled = False
             if residual >= scalar(wp.inf):

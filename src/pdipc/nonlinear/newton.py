@@ -405,7 +405,8 @@ class Newton(Descent):
         return [self.hits, self.attempts, self.work.count, self.numbers, self.model.real.scalar(self.model.settings.tolerance)]
 
     def _lags_now(self) -> wp.array:
-        self.device.launch_serial(_positive(self.model.real), [self.lagging, self.searching])
+        inputs = [self.lagging, self.restrained, self.numbers, self.searching]
+        self.device.launch_serial(_taking_over(self.model.real), inputs)
         return self.searching
 
     def solve(self) -> None:
@@ -494,9 +495,19 @@ class Newton(Descent):
 
 
 @functools.cache
-def _positive(real: Real) -> wp.Kernel:
-    @wp.kernel(module=real.module(f"{__name__}.positive"))
-    def positive(first: int, number: wp.array(dtype=wp.int32), flag_out: wp.array(dtype=wp.int32)):
-        flag_out[0] = wp.where(number[0] > 0, 1, 0)
+def _taking_over(real: Real) -> wp.Kernel:
+    @wp.kernel(module=real.module(f"{__name__}.taking_over"))
+    def taking_over(
+        first: int,
+        lagging: wp.array(dtype=wp.int32),
+        restrained: wp.array(dtype=wp.int32),
+        numbers: wp.array(dtype=real.scalar),
+        flag_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether friction takes over the normal forces of now: not while something is squeezed, which pushes far more than it will in the end."""
+        flag_out[0] = 0
+        if lagging[0] > 0 and restrained[0] == 0:
+            flag_out[0] = 1
+            numbers[status.PUSH_TAKEN] = numbers[status.PUSH]
 
-    return positive  # pyright: ignore[reportReturnType]
+    return taking_over  # pyright: ignore[reportReturnType]
