@@ -504,9 +504,12 @@ def _taking_over(real: Real) -> wp.Kernel:
         numbers: wp.array(dtype=real.scalar),
         flag_out: wp.array(dtype=wp.int32),
     ):
-        """Whether friction takes over the normal forces of now: not while something is squeezed, which pushes far more than it will in the end."""
+        """Whether friction takes over the normal forces of now: while something is squeezed, which pushes far more than it will in the end, only
+        where they have become less.
+        """
         flag_out[0] = 0
-        if lagging[0] > 0 and restrained[0] == 0:
+        less = numbers[status.PUSH] < numbers[status.PUSH_TAKEN]
+        if lagging[0] > 0 and (restrained[0] == 0 or less):
             flag_out[0] = 1
             numbers[status.PUSH_TAKEN] = numbers[status.PUSH]
 
