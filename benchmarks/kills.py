@@ -72,6 +72,9 @@ def start(arguments: list[str], log: Path, largest_file: int | None = None) -> i
 
         traceback.print_exc()
     finally:
+        signal.pthread_sigmask(
+            signal.SIG_BLOCK, {signal.SIGINT}
+        )  # a second one here would leave by the parent's way, and clear its folder
         with contextlib.suppress(Exception):
             sys.stdout.flush()
             sys.stderr.flush()
