@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pdipc
+from pdipc.integration import status
 from pdipc.output.forces import ContactForces
 
 from .scenes import floor, scene, solid
@@ -216,3 +217,24 @@ def test_friction_is_bounded_by_the_normal_forces_that_a_step_ends_with():
         assert friction <= 0.6 * normal
         touched += normal > 0.0
     assert touched >= 2
+
+
+def test_friction_knows_what_contacts_push_with_where_a_step_starts():
+    """Whatever the step before has left: a run that is taken up again has nothing of it."""
+    simulation = pdipc.Simulation(scene([block()], [floor()], contact={"friction": 0.5, **NEAR}), "cpu")
+    for _ in range(5):
+        simulation.step()
+    method = simulation.work.method
+    simulation.work.recorded = False
+    freeze, taken = method.freeze, []
+
+    def noted():
+        forces = np.linalg.norm(method.pairs.force_of_vertex.numpy(), axis=1)
+        freeze()
+        taken.append((method.numbers.numpy()[status.PUSH_TAKEN], forces.max()))
+
+    method.freeze = noted
+    method.numbers.fill_(1e30)
+    simulation.step()
+    assert taken[0][1] > 1.0
+    assert taken[0][0] == pytest.approx(taken[0][1])

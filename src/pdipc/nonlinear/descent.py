@@ -28,12 +28,10 @@ from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 
 FRICTION_LAGS = 12  # outer iterations without restraint in which friction's normal forces are renewed; then they stay, so that a limit is reached
-STALE, GROSS = (
-    2.0,
-    10.0,
-)  # times what contacts push with now, or the other way round: normal forces that friction does not end with; in a step's second half
+STALE = 2.0  # times what contacts push with now, or the other way round: normal forces that friction does not end with
+GROSS = 10.0  # the same in the second half of a step
 HALVINGS = 30  # of an island's step, then it stays where it is
-SQUEEZED = 0.01  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap
+SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
 RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below that
 LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
@@ -248,22 +246,24 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         u_end: wp.array(dtype=vec3),
         x_end: wp.array(dtype=vec3),
-        barrier: wp.array(dtype=vec3),
         u_out: wp.array(dtype=vec3),
         x_out: wp.array(dtype=vec3),
         lag_out: wp.array(dtype=scalar),
-        push_out: wp.array(dtype=scalar),
     ):
-        """The motion is made. lag: how far a scripted vertex is from its goal, m. push: the force of barriers on it, N, where that is asked for."""
+        """The motion is made. lag: how far a scripted vertex is from its goal, m."""
         i = first + wp.tid()
         lag_out[i] = scalar(0.0)
-        if barrier:
-            push_out[i] = wp.length(barrier[i])
         if overflow[0] == 0:
             u_out[i] = u_end[i]
             x_out[i] = x_end[i]
             if free[i] == scalar(0.0):
                 lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
+
+    @wp.kernel(module=module)
+    def press(first: int, barrier: wp.array(dtype=vec3), push_out: wp.array(dtype=scalar)):
+        """The force of barriers on each vertex, N."""
+        i = first + wp.tid()
+        push_out[i] = wp.length(barrier[i])
 
     @wp.kernel(module=module)
     def commit_energies(
@@ -553,7 +553,7 @@ class Descent:
         self.attempts, self.searching, self.hits, self.lagging, self.project, self.restrained, self.lowered = flags
         self.restraint = zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest = Largest(device, real, [n, n])
+        self.largest, self.largest_push = Largest(device, real, [n, n]), Largest(device, real, [n])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -582,9 +582,17 @@ class Descent:
             self.friction.lag()
         self._evaluate(w.u, w.x)
         self._keep_energies()
+        self._measure_push()
+        self.largest_push.find([self.pushes], self.numbers, [status.PUSH])
         if w.script.moves:
             self._find_crowded()
             w.script.hold()
+
+    def _measure_push(self) -> None:
+        """What contacts push with since the potential was evaluated last, where friction asks for it."""
+        if self.friction is not None:
+            inputs = [self.pairs.force_of_vertex, self.pushes]
+            self.device.launch(self.descending.press, self.model.vertex_count, inputs)
 
     def _find_crowded(self) -> None:
         """Which movers wait, as things are since the potential was evaluated."""
@@ -667,8 +675,8 @@ class Descent:
 
         device.loop(self.searching, search)
         inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
-        barrier = None if self.friction is None else self.pairs.force_of_vertex
-        device.launch(k.commit, n, [*inputs, barrier, w.u, w.x, self.lags, self.pushes])
+        device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
+        self._measure_push()
         self.largest.find([self.lags, self.pushes], self.numbers, [status.LAG, status.PUSH])
         self._keep_energies()
         if w.script.moves:
