@@ -40,7 +40,7 @@ from pdipc.scene.motion import Approach, Deforming, Trajectory
 from pdipc.scene.movers import MOST, Mover, movers_of
 
 CATCH_UP = 2.0  # times the script's pace
-LOOKS, SAMPLES = 4, 256  # times in a step, and in all, at which a late mover looks whether its script has come back
+LOOKS = 4  # times in a step at which a late mover looks whether its script has come back
 TRIES = 24  # outer iterations in which a mover goes on to one waypoint
 PATIENCE = 0.7  # of the cap of outer iterations
 AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
@@ -546,7 +546,9 @@ def _towards(now: np.ndarray, goal: np.ndarray, within: float) -> np.ndarray:
 
 
 def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: float) -> float:
-    """The last time, s, from `stopped` to `now` at which a script's pose is the one at `stopped`, but for the deviation of chords. h: time step, s."""
+    """The last time, s, in the step of h that ends at `now`, at which a script's pose is the one at `stopped`, s, but for the deviation of chords; else
+    `stopped`. What came before was looked at in the steps before.
+    """
     turn, place = path.pose(stopped)
     reach = mover.reach(path)
 
@@ -555,7 +557,7 @@ def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: floa
         rotation, p = path.pose(time)
         return float(np.linalg.norm(p - place) + reach * np.linalg.norm(rotation - turn))
 
-    times = np.linspace(stopped, now, min(SAMPLES, LOOKS * int(np.ceil((now - stopped) / h))) + 1)
+    times = np.linspace(max(stopped, now - h), now, LOOKS + 1)
     far = np.array([away(time) for time in times])
     low = np.flatnonzero((far[1:] <= far[:-1]) & (far[1:] <= np.append(far[2:], np.inf))) + 1
     for k in low[::-1]:
