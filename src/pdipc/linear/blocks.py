@@ -7,7 +7,8 @@ stored, and a product takes differences,
 
 which keeps the common motion of a stiff body exact in any precision. held: mass over h^2, damping, and attachments to points.
 
-The pattern is made once; the values are gathered by block, each from the elements that have both vertices.
+The pattern is made once; the values are gathered by block, each from the elements that have both vertices, and written to both places
+that they have in a symmetric matrix.
 """
 
 import functools
@@ -74,12 +75,18 @@ class BlockMatrix:
         fixed_key = fixed_rows[inside].astype(np.int64) * n + fixed_columns[inside]
         key = row * n + column
         keys = np.union1d(key, fixed_key)
+        self.nnz = len(keys)
+        # the blocks that are gathered: of two that are each other's transpose, the one above the diagonal
+        at, turned = keys // n, keys % n * n + keys // n
+        mirror = np.searchsorted(keys, turned)
+        mirrored = keys[np.minimum(mirror, self.nnz - 1)] == turned if self.nnz else np.zeros(0, dtype=bool)
+        gathered = np.flatnonzero(~mirrored | (at < keys % n))
         order = np.argsort(key, kind="stable")
-        starts = np.searchsorted(key[order], np.append(keys, n * n))
-        scalars = np.zeros(len(keys))
+        first, end = (np.searchsorted(key[order], keys[gathered], side=side) for side in ("left", "right"))
+        scalars = np.zeros(self.nnz)
         scalars[np.searchsorted(keys, fixed_key)] = fixed[inside]
         offsets = np.searchsorted(keys, np.arange(n + 1) * n)
-        self.nnz = len(keys)
+        self._gathered = len(gathered)
         self.pattern = sp.csr_matrix((np.ones(self.nnz), keys % n, offsets), shape=(n, n))
 
         def upload(values: np.ndarray, dtype) -> wp.array:
@@ -91,7 +98,8 @@ class BlockMatrix:
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.held = wp.array(np.where(free, held, 0.0), dtype=real.scalar, device=device.warp)
         self._unrestrained = wp.clone(self.held)
-        self._starts = wp.array(starts.astype(np.int32), device=device.warp)
+        self._first, self._end, self._places = (upload(each, wp.int32) for each in (first, end, gathered))
+        self._mirrors = upload(np.where(mirrored, mirror, -1)[gathered], wp.int32)
         self._slots = upload(slot[order], wp.int32)
         self._scalars = upload(scalars, real.scalar)
         self._blocks = projector.blocks  # made now: recording must not allocate
@@ -106,8 +114,8 @@ class BlockMatrix:
         """Launches the values at x = base + u; project: see `Hessians`."""
         k, device = self._kernels, self.device
         self.projector.differentiate(base, u, project)
-        inputs = [self._starts, self._slots, self._scalars, self._blocks, self.values]
-        device.launch(k.gather, self.nnz, inputs, grain=16)
+        inputs = [self._first, self._end, self._slots, self._places, self._mirrors, self._scalars, self._blocks, self.values]
+        device.launch(k.gather, self._gathered, inputs, grain=16)
         device.launch(k.gather_diagonal, self.count, [self.offsets, self.held, self.values, self.diagonal], grain=32)
 
 
@@ -127,8 +135,11 @@ def kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module)
     def gather(
         first: int,
-        starts: wp.array(dtype=wp.int32),
+        begins: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         slots: wp.array(dtype=wp.int32),
+        places: wp.array(dtype=wp.int32),
+        mirrors: wp.array(dtype=wp.int32),
         scalars: wp.array(dtype=scalar),
         blocks: wp.array(dtype=mat33),
         values_out: wp.array(dtype=mat33),
@@ -137,18 +148,20 @@ def kernels(real: Real) -> SimpleNamespace:
         e = first + wp.tid()
         total = mat33()
         turned = mat33()
-        for k in range(starts[e], starts[e + 1]):
+        for k in range(begins[e], ends[e]):
             s = slots[k]
             if s % 2 == 0:
                 total += blocks[s // 2]
             else:
                 turned += blocks[s // 2]
         total += wp.transpose(turned)
-        c = scalars[e]
+        c = scalars[places[e]]
         total[0, 0] = total[0, 0] + c
         total[1, 1] = total[1, 1] + c
         total[2, 2] = total[2, 2] + c
-        values_out[e] = total
+        values_out[places[e]] = total
+        if mirrors[e] >= 0:
+            values_out[mirrors[e]] = wp.transpose(total)
 
     @wp.kernel(module=module)
     def gather_diagonal(
