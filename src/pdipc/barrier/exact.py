@@ -20,7 +20,7 @@ import warp as wp
 from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
-from pdipc.device.launch import Span
+from pdipc.device.launch import Largest, Span
 from pdipc.device.precision import Real
 from pdipc.linear import contact_rows
 from pdipc.linear.contact_rows import ContactRows, first_entry
@@ -210,6 +210,27 @@ def kernels(real: Real) -> SimpleNamespace:
                 hessian_out[k] = hessian
 
     @wp.kernel(module=module)
+    def measure_opening(
+        first: int,
+        count: wp.array(dtype=wp.int32),
+        p: wp.array(dtype=vec3),
+        quads: wp.array(dtype=wp.vec4i),
+        weights: wp.array(dtype=vec4),
+        normals: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=scalar),
+        opening_out: wp.array(dtype=scalar),
+    ):
+        """By what part of itself the motion p changes each pair's gap, to first order."""
+        k = first + wp.tid()
+        opening = scalar(0.0)
+        if k < count[0]:
+            q = quads[k]
+            a = weights[k]
+            change = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
+            opening = wp.abs(wp.dot(normals[k], change) / gaps[k])
+        opening_out[k] = opening
+
+    @wp.kernel(module=module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -361,6 +382,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         differentiate=differentiate,
+        measure_opening=measure_opening,
         gather=gather,
         stretch=stretch,
         spread=spread,
@@ -396,6 +418,14 @@ class BarrierTerm(ActivePairs):
         self.first_bent, self.second_bent = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
         self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
         self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.kappa), capacity)
+        self.opening = wp.zeros(capacity, dtype=real.scalar, device=device)
+        self.largest_opening = Largest(self.device, real, [capacity])
+
+    def measure_opening(self, p: wp.array, numbers: wp.array, slot: int) -> None:
+        """Launches numbers[slot] = by what part of itself the motion p would change the gap of a frozen pair, at most."""
+        inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.opening]
+        self.device.launch(self.exact.measure_opening, self.capacity, inputs)
+        self.largest_opening.find([self.opening], numbers, [slot])
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""

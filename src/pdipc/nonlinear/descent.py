@@ -40,6 +40,7 @@ SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
+OPENING = 0.25  # of a gap: a step that changes one by more is not near the end; out of a tiny gap each step of Newton's method doubles it
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -408,7 +409,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if projected[0] != 0:
                 left = left / scalar(EXACT)
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
-            done = left <= tolerance and attempts[0] == 1
+            done = left <= tolerance and attempts[0] == 1 and numbers[status.OPENING] <= scalar(OPENING)
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
