@@ -210,7 +210,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 hessian_out[k] = hessian
 
     @wp.kernel(module=module)
-    def measure_opening(
+    def measure_bend(
         first: int,
         count: wp.array(dtype=wp.int32),
         p: wp.array(dtype=vec3),
@@ -218,17 +218,28 @@ def kernels(real: Real) -> SimpleNamespace:
         weights: wp.array(dtype=vec4),
         normals: wp.array(dtype=vec3),
         gaps: wp.array(dtype=scalar),
-        opening_out: wp.array(dtype=scalar),
+        activation: wp.array(dtype=scalar),
+        stiffness: wp.array(dtype=scalar),
+        held: wp.array(dtype=scalar),
+        change_out: wp.array(dtype=scalar),
     ):
-        """By what part of itself the motion p changes each pair's gap, to first order."""
+        """By how much the motion p changes the curvature of each pair's barrier, as part of what it is with the inertia that it acts against."""
         k = first + wp.tid()
-        opening = scalar(0.0)
+        result = zero
         if k < count[0]:
             q = quads[k]
             a = weights[k]
-            change = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
-            opening = wp.abs(wp.dot(normals[k], change) / gaps[k])
-        opening_out[k] = opening
+            lever = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
+            yields = zero
+            for s in range(4):
+                if held[q[s]] > zero:
+                    yields += a[s] * a[s] / held[q[s]]
+            d = gaps[k]
+            after = wp.max(d + wp.dot(normals[k], lever), scalar(0.1) * d)
+            now = stiffness[k] * yields * barrier.barrier_hessian(d, activation[k])
+            then = stiffness[k] * yields * barrier.barrier_hessian(after, activation[k])
+            result = wp.abs(then - now) / wp.max(now, one)
+        change_out[k] = result
 
     @wp.kernel(module=module)
     def gather(
@@ -382,7 +393,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         differentiate=differentiate,
-        measure_opening=measure_opening,
+        measure_bend=measure_bend,
         gather=gather,
         stretch=stretch,
         spread=spread,
@@ -418,14 +429,16 @@ class BarrierTerm(ActivePairs):
         self.first_bent, self.second_bent = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
         self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
         self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.kappa), capacity)
-        self.opening = wp.zeros(capacity, dtype=real.scalar, device=device)
-        self.largest_opening = Largest(self.device, real, [capacity])
+        self.change = wp.zeros(capacity, dtype=real.scalar, device=device)
+        self.largest_change = Largest(self.device, real, [capacity])
 
-    def measure_opening(self, p: wp.array, numbers: wp.array, slot: int) -> None:
-        """Launches numbers[slot] = by what part of itself the motion p would change the gap of a frozen pair, at most."""
-        inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.opening]
-        self.device.launch(self.exact.measure_opening, self.capacity, inputs)
-        self.largest_opening.find([self.opening], numbers, [slot])
+    def measure_change(self, p: wp.array, held: wp.array, numbers: wp.array, slot: int) -> None:
+        """Launches numbers[slot]: by how much the motion p would change the curvature of a frozen pair at most, as part of that, or of the
+        inertia that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
+        """
+        inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, held]
+        self.device.launch(self.exact.measure_bend, self.capacity, [*inputs, self.change], grain=4)
+        self.largest_change.find([self.change], numbers, [slot])
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""

@@ -28,8 +28,8 @@ from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 
 FRICTION_LAGS = 12  # outer iterations without restraint in which friction's normal forces are renewed; then they stay, so that a limit is reached
-STALE = 2.0  # times what contacts push with now, or the other way round: normal forces that friction does not end with
-GROSS = 10.0  # the same in the second half of a step
+STALE = 1.1  # times what contacts push with now, or the other way round: normal forces that friction does not end with
+GROSS = 1.1  # the same in the second half of a step
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -40,7 +40,7 @@ SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
-OPENING = 0.25  # of a gap: a step that changes one by more is not near the end; out of a tiny gap each step of Newton's method doubles it
+BARRIER_CHANGE = 0.4  # of the curvature of a barrier: a step that changes one by more is not near the end; out of a tiny gap each doubles it
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -409,7 +409,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if projected[0] != 0:
                 left = left / scalar(EXACT)
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
-            done = left <= tolerance and attempts[0] == 1 and numbers[status.OPENING] <= scalar(OPENING)
+            done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= scalar(BARRIER_CHANGE)
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
