@@ -14,7 +14,7 @@ COUNTS = 8
 
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
 # the largest force of inertia, to compare it with; how far something scripted is behind, m; the motion that the iteration before wanted, and
-# the one that last wanted it while nothing was held back, m; with friction, the largest force of barriers on a vertex, N, now and where friction took
-# over its normal forces; by what part the last motion wanted would change the curvature of a barrier at most
-MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY, PUSH, PUSH_TAKEN, BARRIER_CHANGE = (wp.constant(place) for place in range(9))
-NUMBERS = 9
+# the one that last wanted it while nothing was held back, m; by what part the last motion
+# wanted would change the curvature of a barrier, at most
+MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY, BARRIER_CHANGE = (wp.constant(place) for place in range(7))
+NUMBERS = 7

@@ -27,9 +27,6 @@ from pdipc.device.sums import BodySums
 from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
 
-FRICTION_LAGS = 12  # outer iterations without restraint in which friction's normal forces are renewed; then they stay, so that a limit is reached
-STALE = 1.1  # times what contacts push with now, or the other way round: normal forces that friction does not end with
-GROSS = 1.1  # the same in the second half of a step
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -40,7 +37,12 @@ SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
 }  # of the potential: a rise that rounding makes; beside it what the linear solve leaves
-BARRIER_CHANGE = 0.4  # of the curvature of a barrier: a step that changes one by more is not near the end; out of a tiny gap each doubles it
+BARRIER_CHANGE = (
+    0.4  # of the curvature of a barrier: a step that changes one by more is not near the end; out of a tiny gap each doubles it
+)
+FORCE_CHANGE = (
+    0.1  # the same where there is friction, which the next step takes over: what pairs push with is then true to a hundredth
+)
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -261,12 +263,6 @@ def kernels(real: Real) -> SimpleNamespace:
                 lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
 
     @wp.kernel(module=module)
-    def press(first: int, barrier: wp.array(dtype=vec3), push_out: wp.array(dtype=scalar)):
-        """The force of barriers on each vertex, N."""
-        i = first + wp.tid()
-        push_out[i] = wp.length(barrier[i])
-
-    @wp.kernel(module=module)
     def commit_energies(
         first: int,
         base_new: wp.array(dtype=wide),
@@ -329,7 +325,6 @@ def kernels(real: Real) -> SimpleNamespace:
     def start(
         first: int,
         bodies: int,
-        lagging_out: wp.array(dtype=wp.int32),
         restraint_out: wp.array(dtype=scalar),
         restrained_out: wp.array(dtype=wp.int32),
         squeezed_out: wp.array(dtype=wp.int32),
@@ -338,7 +333,6 @@ def kernels(real: Real) -> SimpleNamespace:
             restraint_out[b] = scalar(0.0)
             squeezed_out[b] = 0
         restrained_out[0] = 0
-        lagging_out[0] = FRICTION_LAGS
 
     @wp.kernel(module=module)
     def before_search(
@@ -366,10 +360,10 @@ def kernels(real: Real) -> SimpleNamespace:
         overflow: wp.array(dtype=wp.int32),
         clock: wp.array(dtype=wide),
         tolerance: scalar,
+        most_change: scalar,
         max_outer: int,
         budget_ms: wide,
         numbers: wp.array(dtype=scalar),
-        lagging: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
         going_out: wp.array(dtype=wp.int32),
     ):
@@ -393,13 +387,9 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.OUTER] = count[status.OUTER] + 1
             count[status.SINCE] = count[status.SINCE] + 1
             count[status.BARRIERS] = pairs[0]
-            # friction waits for what is squeezed, for half of the step at most
-            if restrained[0] == 0 or 2 * count[status.SINCE] > max_outer:
-                lagging[0] = lagging[0] - 1
             if script[ARRIVED] != 0:
                 count[status.SINCE] = 0
                 count[status.STALLED] = 0
-                lagging[0] = FRICTION_LAGS
             if hits[0] > 0:
                 count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
             if attempts[0] > 1:
@@ -409,18 +399,10 @@ def kernels(real: Real) -> SimpleNamespace:
             if projected[0] != 0:
                 left = left / scalar(EXACT)
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
-            done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= scalar(BARRIER_CHANGE)
+            done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= most_change
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
-            if lagging[0] <= 0 and settled:
-                least = wp.min(numbers[status.PUSH], numbers[status.PUSH_TAKEN])
-                allowed = scalar(STALE)
-                if 2 * count[status.SINCE] > max_outer:
-                    allowed = scalar(GROSS)
-                if wp.max(numbers[status.PUSH], numbers[status.PUSH_TAKEN]) > allowed * least:
-                    lagging[0] = FRICTION_LAGS
-                    settled = False
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind and script[AHEAD] == 0:
@@ -544,17 +526,17 @@ class Descent:
         vec3, scalar = real.vec3, real.scalar
         self.inertial, self.p = zeros(vec3), zeros(vec3, n + 1)
         self.vertex_energy = zeros(wp.float64)
-        self.lags, self.pushes, self.numbers = zeros(scalar), zeros(scalar), zeros(scalar, status.NUMBERS)
+        self.lags, self.numbers = zeros(scalar), zeros(scalar, status.NUMBERS)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
-        flags = (zeros(wp.int32, 1) for _ in range(7))
-        self.attempts, self.searching, self.hits, self.lagging, self.project, self.restrained, self.lowered = flags
+        flags = (zeros(wp.int32, 1) for _ in range(6))
+        self.attempts, self.searching, self.hits, self.project, self.restrained, self.lowered = flags
         self.restraint = zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest, self.largest_push = Largest(device, real, [n, n]), Largest(device, real, [n])
+        self.largest = Largest(device, real, [n])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -574,26 +556,16 @@ class Descent:
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        self.device.launch_serial(
-            self.descending.start, [self.bodies, self.lagging, self.restraint, self.restrained, self.squeezed]
-        )
+        self.device.launch_serial(self.descending.start, [self.bodies, self.restraint, self.restrained, self.squeezed])
         self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
             self.friction.lag()
         self._evaluate(w.u, w.x)
         self._keep_energies()
-        self._measure_push()
-        self.largest_push.find([self.pushes], self.numbers, [status.PUSH])
         if w.script.moves:
             self._find_crowded()
             w.script.hold()
-
-    def _measure_push(self) -> None:
-        """What contacts push with since the potential was evaluated last, where friction asks for it."""
-        if self.friction is not None:
-            inputs = [self.pairs.force_of_vertex, self.pushes]
-            self.device.launch(self.descending.press, self.model.vertex_count, inputs)
 
     def _find_crowded(self) -> None:
         """Which movers wait, as things are since the potential was evaluated."""
@@ -677,8 +649,7 @@ class Descent:
         device.loop(self.searching, search)
         inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
-        self._measure_push()
-        self.largest.find([self.lags, self.pushes], self.numbers, [status.LAG, status.PUSH])
+        self.largest.find([self.lags], self.numbers, [status.LAG])
         self._keep_energies()
         if w.script.moves:
             self._find_crowded()
@@ -693,8 +664,9 @@ class Descent:
             self.restrained,
             self.lowered,
         ]
-        limits = [model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0]
+        change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
+        limits = [model.real.scalar(s.tolerance), model.real.scalar(change), s.max_outer, s.budget_ms or 0.0]
         times = [w.candidates.overflow, w.clock]
-        device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, self.lagging, w.count, w.going])
+        device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, w.count, w.going])
         which = [self.islands.label, self.islands.driven, self.squeezed, self.attempts, self.island_least]
         device.launch_serial(k.restrain, [self.bodies, *which, self.restraint, self.restrained])

@@ -383,7 +383,6 @@ class Newton(Descent):
         w = self.work
         self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
-            self.device.when(self._lags_now(), self.friction.lag)
             self.friction.differentiate(w.u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
         if self.work.script.moves:
@@ -403,11 +402,6 @@ class Newton(Descent):
     def _last(self) -> list:
         """What is known of the last outer iteration."""
         return [self.hits, self.attempts, self.work.count, self.numbers, self.model.real.scalar(self.model.settings.tolerance)]
-
-    def _lags_now(self) -> wp.array:
-        inputs = [self.lagging, self.restrained, self.numbers, self.searching]
-        self.device.launch_serial(_taking_over(self.model.real), inputs)
-        return self.searching
 
     def solve(self) -> None:
         """Lines 6 to 12: x~ = x + p with K p = -grad Phi."""
@@ -493,25 +487,3 @@ class Newton(Descent):
         self.solver.solve(self.p, r.zero, couplings, 0.0, self.nobody, REBOUND_TOLERANCE[model.real.name])
         self.device.launch(r.kernels.move, n, [w.u, model.free, self.p, r.u_now])
         self.solver.clear(r.zero)
-
-
-@functools.cache
-def _taking_over(real: Real) -> wp.Kernel:
-    @wp.kernel(module=real.module(f"{__name__}.taking_over"))
-    def taking_over(
-        first: int,
-        lagging: wp.array(dtype=wp.int32),
-        restrained: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=real.scalar),
-        flag_out: wp.array(dtype=wp.int32),
-    ):
-        """Whether friction takes over the normal forces of now: while something is squeezed, which pushes far more than it will in the end, only
-        where they have become less.
-        """
-        flag_out[0] = 0
-        less = numbers[status.PUSH] < numbers[status.PUSH_TAKEN]
-        if lagging[0] > 0 and (restrained[0] == 0 or less):
-            flag_out[0] = 1
-            numbers[status.PUSH_TAKEN] = numbers[status.PUSH]
-
-    return taking_over  # pyright: ignore[reportReturnType]
