@@ -8,9 +8,10 @@ STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places
 RUNNING, CONVERGED, LAGGING, CAPPED, OUT_OF_TIME, STALLING, OVERFLOW, NOT_FINITE = (wp.constant(code) for code in range(8))
 
 # `count`, int32: of a step
-# OUTER: outer iterations; SINCE: those since something scripted came to a waypoint
-STATUS, OUTER, TRUNCATIONS, BARRIERS, SEARCHES, STALLED, MOVING, SINCE = (wp.constant(place) for place in range(8))
-COUNTS = 8
+# OUTER: outer iterations; SINCE: those since something scripted came to a waypoint; IDLE: those in a row that
+# lowered no potential by more than rounding
+STATUS, OUTER, TRUNCATIONS, BARRIERS, SEARCHES, STALLED, MOVING, SINCE, IDLE = (wp.constant(place) for place in range(9))
+COUNTS = 9
 
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
 # the largest force of inertia, to compare it with; how far something scripted is behind, m; the motion that the iteration before wanted, and

@@ -33,6 +33,7 @@ RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeez
 RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below that
 LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
+IDLE = 12  # outer iterations in a row in which no potential falls by more than rounding, likewise
 SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
@@ -396,6 +397,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 count[status.SEARCHES] = count[status.SEARCHES] + 1
             if attempts[0] > HALVINGS:
                 count[status.STALLED] = count[status.STALLED] + 1
+            count[status.IDLE] = count[status.IDLE] + 1
+            if lowered[0] != 0 or count[status.MOVING] != 0 or script[ARRIVED] != 0:
+                count[status.IDLE] = 0
             if projected[0] != 0:
                 left = left / scalar(EXACT)
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
@@ -409,7 +413,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 code = status.CONVERGED
             elif settled and script[WILL] == 0:
                 code = status.LAGGING
-            elif count[status.STALLED] >= STALLS:
+            elif count[status.STALLED] >= STALLS or count[status.IDLE] >= IDLE:
                 code = status.STALLING
             elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
