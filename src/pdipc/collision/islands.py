@@ -1,4 +1,4 @@
-"""Which bodies are near each other: an island is a set of bodies that candidate pairs connect.
+"""Which bodies are near each other: an island is a set of bodies that candidate pairs, or pairs that rub, connect.
 
 Islands do not see each other, so each can have a step length of its own: one that is jammed holds up no other. Obstacles connect nothing.
 """
@@ -118,6 +118,7 @@ class Islands:
     """body: (n,) int32, the simulated body of each vertex, -1 for obstacles. label: (bodies,) the island of each body, named by its first body.
     driven: (bodies,) whether something that follows a script moves the body in this outer iteration.
 
+    beside: what else has pairs, each with `count`, `quads` and `capacity`: friction, whose pairs were near where the step started.
     ranges: (first, last) vertices of each simulated body; joined: (k, 2) bodies that attachments join; pinned: (k, 2) scripted
     vertices and the simulated bodies that they move: their own, or those attached to them.
     """
@@ -152,6 +153,7 @@ class Islands:
         size = 1 if self.together else max(1, self.count**2)
         self._near = wp.zeros(size, dtype=wp.int32, device=device.warp)
         self.driven = wp.zeros(max(1, self.count), dtype=wp.int32, device=device.warp)
+        self.beside: list = []
         self._kernels = kernels(real)
 
     def find(self, candidates: Candidates) -> None:
@@ -160,7 +162,7 @@ class Islands:
             return
         k, device = self._kernels, self.device
         device.launch(k.clear, self.count**2, [self._near])
-        for c in candidates.lists:
+        for c in [*candidates.lists, *self.beside]:
             device.launch_list(k.connect, c.capacity, [c.count, c.quads, self.body, self.count, self._near])
         device.launch_serial(k.label, [self.count, self._fixed, self._near, self.label, candidates.renewed])
 
@@ -173,7 +175,7 @@ class Islands:
         """Launches `driven` for the motion u -> u_tilde."""
         k, device = self._kernels, self.device
         device.launch(k.clear, max(1, self.count), [self.driven])
-        for c in candidates.lists:
+        for c in [*candidates.lists, *self.beside]:
             device.launch_list(k.mark_driven, c.capacity, [c.count, c.quads, self.body, u, u_tilde, self.driven])
         if self._pinned_count:
             device.launch(k.mark_pinned, self._pinned_count, [self._pinned, u, u_tilde, self.driven])

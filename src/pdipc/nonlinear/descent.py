@@ -34,6 +34,7 @@ RELEASE, RELEASED = 0.25, 0.3  # the restraint fades so fast, and is over below 
 LEAST_PART, MOST_RESTRAINT = 0.01, 1.0e8
 STALLS = 3  # outer iterations without any progress of some island, then the step ends
 IDLE = 12  # outer iterations in a row in which no potential falls by more than rounding, likewise
+ROUNDED = 3.0  # tolerances: what may then be left of a step that has converged
 SLACK = {
     "float32": 4.0e-7,
     "float64": 1.0e-12,
@@ -406,6 +407,8 @@ def kernels(real: Real) -> SimpleNamespace:
             done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= most_change
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
+            if count[status.IDLE] >= IDLE and left <= scalar(ROUNDED) * tolerance:
+                done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
@@ -513,6 +516,7 @@ class Descent:
         owner = np.where(assembly.body_of_vertex < len(simulated), assembly.body_of_vertex, -1)
         self.bodies = len(simulated)
         self.islands = islands_of(model, owner)
+        self.islands.beside = [] if self.friction is None else [self.friction]
         work.truncation.body, work.truncation.body_count = self.islands.body, len(simulated)
         work.truncation.deep = wp.zeros(max(1, len(simulated)), dtype=wp.int32, device=device.warp)
         of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
@@ -561,10 +565,10 @@ class Descent:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
         self.device.launch_serial(self.descending.start, [self.bodies, self.restraint, self.restrained, self.squeezed])
-        self.islands.find(w.candidates)
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
             self.friction.lag()
+        self.islands.find(w.candidates)
         self._evaluate(w.u, w.x)
         self._keep_energies()
         if w.script.moves:
