@@ -209,6 +209,12 @@ def _lock(folder: Path) -> lock.Lock:
         raise RunLockedError(str(error)) from None
 
 
+def resumable_step(run: "Run") -> int:
+    """The step that `RunWriter.resume` goes on from; 0, too, where a run begins again."""
+    checkpoint = _latest_checkpoint(run)
+    return 0 if checkpoint is None else checkpoint[0]
+
+
 def _latest_checkpoint(run: "Run") -> tuple[int, dict[str, np.ndarray]] | None:
     steps = {record["step"] for record in run.records}
     for path in sorted((run.folder / "checkpoints").glob("*.npz"), key=_step_of, reverse=True):
