@@ -378,7 +378,7 @@ def test_usd_that_moves_or_has_no_unit_is_said(tmp_path):
     assert mesh.vertices[:, 2] == pytest.approx(1.0)
     assert mesh.notes == [
         "it does not say metersPerUnit: its numbers were taken as m",
-        "it moves or deforms at 2 times: it was read as it is at the first",
+        "it moves or deforms at 2 times: it was read as it is at the start",
     ]
 
 

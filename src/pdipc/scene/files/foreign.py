@@ -14,6 +14,7 @@ from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, D
 from pdipc.scene.files.volumes import is_gmsh
 
 LISTED = 10  # prims that a message names
+MESHES = ("Mesh", "TetMesh")
 
 
 def by_meshio(path: Path) -> Contents:
@@ -76,33 +77,19 @@ def glb(path: Path) -> Contents:
 
 
 def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
-    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times; below: only those of
+    """All meshes of a stage, where they stand at its start, in metres with y up; frames: at all of its times from then on; below: only those of
     the prim at this path and below it.
     """
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
     except ImportError as error:
         raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
     stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
-    first = Usd.TimeCode.EarliestTime()
-    prims, found, others, hidden = [], Contents(np.zeros((0, 3))), {}, 0
+    start = usd_start(stage)
+    first = Usd.TimeCode(start)
     root = stage.GetPseudoRoot() if below is None else _usd_prim(stage, path, below)
-    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
-        kind = str(prim.GetTypeName())
-        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
-            continue
-        purpose = UsdGeom.Imageable(prim).ComputePurpose()
-        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
-            hidden += 1
-            continue
-        if purpose in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):  # they stand for what is there as well
-            kind = f"{kind} of purpose {purpose}"
-        elif kind in ("Mesh", "TetMesh") and prim.GetAttribute("points").Get(first):
-            prims.append(prim)
-            continue
-        elif kind in ("Mesh", "TetMesh"):
-            kind = f"{kind} without points"
-        others[kind] = others.get(kind, 0) + 1
+    prims, others, hidden = usd_meshes(root, first)
+    found = Contents(np.zeros((0, 3)))
     if not prims:
         raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh')
     convert, said = _units(stage)
@@ -120,7 +107,8 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
             counts.append(sides)
         size += own
     found.polygons = np.concatenate(corners), np.concatenate(counts)
-    times = sorted({time for prim in prims for time in _usd_times(prim)})
+    samples = {time for prim in prims for time in _usd_times(prim)}
+    times = sorted({start, *(time for time in samples if time > start)}) if len(samples) > 1 else [start]
     if frames and len(times) > 1:
         found.frames = np.stack([convert(_usd_points(prims, Usd.TimeCode(time))) for time in times])
         found.times = np.array(times) / stage.GetTimeCodesPerSecond()
@@ -135,6 +123,37 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     return found
 
 
+def usd_start(stage) -> float:
+    """The time code that a simulation begins at: the stage's start; where it says none, its first time sample, or 0."""
+    if stage.HasAuthoredMetadata("startTimeCode"):
+        return stage.GetStartTimeCode()
+    return min((time for prim in stage.Traverse() if prim.GetTypeName() in MESHES for time in _usd_times(prim)), default=0.0)
+
+
+def usd_meshes(root, first) -> tuple[list, dict[str, int], int]:
+    """The meshes that are simulated of a prim and all below it, in their order; what else has a shape, by kind; how many prims are invisible."""
+    from pxr import Usd, UsdGeom
+
+    prims, others, hidden = [], {}, 0
+    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
+        kind = str(prim.GetTypeName())
+        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
+            continue
+        purpose = UsdGeom.Imageable(prim).ComputePurpose()
+        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
+            hidden += 1
+            continue
+        if purpose in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):  # they stand for what is there as well
+            kind = f"{kind} of purpose {purpose}"
+        elif kind in MESHES and prim.GetAttribute("points").Get(first):
+            prims.append(prim)
+            continue
+        elif kind in MESHES:
+            kind = f"{kind} without points"
+        others[kind] = others.get(kind, 0) + 1
+    return prims, others, hidden
+
+
 def _usd_prim(stage, path: Path, wanted: str):
     """The prim at a path. Raises SceneError, with the prims that are meshes, where there is none."""
     from pxr import Sdf
@@ -142,7 +161,7 @@ def _usd_prim(stage, path: Path, wanted: str):
     prim = stage.GetPrimAtPath(wanted) if Sdf.Path.IsValidPathString(wanted) and Sdf.Path(wanted).IsAbsolutePath() else None
     if prim:
         return prim
-    there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in ("Mesh", "TetMesh")]
+    there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in MESHES]
     near = difflib.get_close_matches(wanted, there, n=1)
     hint = f'; did you mean "{near[0]}"?' if near else ";"
     listed = ", ".join(there[:LISTED]) + (", ..." if len(there) > LISTED else "")
@@ -185,15 +204,17 @@ def _usd_faces(prim, size: int, time) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _usd_times(prim) -> list[float]:
-    """The time codes at which a prim's points or its place are given."""
+    """The time codes at which a prim's points are given; where its place is animated, whole ones, too: between keys prims turn, which points that go
+    straight do not follow.
+    """
     from pxr import UsdGeom
 
-    times = list(prim.GetAttribute("points").GetTimeSamples())
+    times, keys = list(prim.GetAttribute("points").GetTimeSamples()), []
     while prim and not prim.IsPseudoRoot():
         if prim.IsA(UsdGeom.Xformable):
-            times += UsdGeom.Xformable(prim).GetTimeSamples()
+            keys += UsdGeom.Xformable(prim).GetTimeSamples()
         prim = prim.GetParent()
-    return times
+    return [*times, *keys, *np.arange(np.ceil(min(keys)), max(keys)).tolist()] if keys else times
 
 
 def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
@@ -220,4 +241,4 @@ def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
 
 
 def _first_of(count: int) -> str:
-    return f"it moves or deforms at {count} times: it was read as it is at the first"
+    return f"it moves or deforms at {count} times: it was read as it is at the start"
