@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pdipc
+from pdipc.export import usd as writer
 from pdipc.export.export import export
 from pdipc.output.results import open_run
 from pdipc.scene.assembly import assemble
@@ -171,3 +172,44 @@ def test_a_stage_comes_in_again_after_it_went_out(shot, tmp_path):
     for frame in (0, FRAMES):
         x = run.positions(frame)[run.topology["body_of_vertex"] == 0]
         np.testing.assert_allclose(body.trajectory.apply(None, float(run.times[frame])), x, atol=SINGLE)
+
+
+@pytest.mark.parametrize("how", ["uniform", "vertex", "faceVarying", "faceVarying, indexed", "uniform, indexed", "constant"])
+def test_normals_follow_in_whichever_way_they_are_given(how):
+    """A flat sheet that is folded along its middle: normals of faces turn with them, those at the fold stay shared where they were shared; one for
+    all of the mesh is no longer right and is blocked.
+    """
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    points, corners = quads(2, 1.0)
+    sheet = mesh(stage, "/Sheet", points, corners.ravel(), np.full(len(corners), 4))
+    interpolation = how.split(",")[0]
+    count = {"uniform": 4, "vertex": 9, "faceVarying": 16, "constant": 1}[interpolation]
+    if how.endswith("indexed"):
+        primvar = UsdGeom.PrimvarsAPI(sheet).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, interpolation)
+        primvar.Set(Vt.Vec3fArray([(0, 0, 1)]))
+        primvar.SetIndices(Vt.IntArray([0] * count))
+    else:
+        sheet.CreateNormalsAttr(Vt.Vec3fArray([(0, 0, 1)] * count))
+        sheet.SetNormalsInterpolation(interpolation)
+    own = np.repeat(np.arange(9)[:, None], 4, axis=1)
+    prim = writer._Prim(stage, sheet.GetPrim(), 0.0, own, np.eye(4)[np.zeros(9, dtype=int)])
+    folded = points.copy()
+    folded[points[:, 0] > 0, 2] = 1.0  # by 45 degrees
+    prim.write(folded, 1.0, [(points, 0.0), (folded, 1.0)], 1.0)
+    if how == "constant":
+        assert not sheet.GetNormalsAttr().HasValue()
+        return
+    primvar = UsdGeom.PrimvarsAPI(sheet).GetPrimvar("normals")
+    found = np.array(primvar.ComputeFlattened(1.0) if primvar.HasValue() else sheet.GetNormalsAttr().Get(1.0))
+    assert len(found) == count
+    of_face = np.array([[0, 0, 1], [-1, 0, 1] / np.sqrt(2)] * 2)
+    if interpolation == "uniform":
+        np.testing.assert_allclose(found, of_face, atol=1e-6)
+        return
+    x = points[corners.ravel()] if interpolation == "faceVarying" else points
+    np.testing.assert_allclose(found[x[:, 0] < 0], np.tile(of_face[0], ((x[:, 0] < 0).sum(), 1)), atol=1e-6)
+    np.testing.assert_allclose(found[x[:, 0] > 0], np.tile(of_face[1], ((x[:, 0] > 0).sum(), 1)), atol=1e-6)
+    shared = found[x[:, 0] == 0]
+    np.testing.assert_allclose(shared, np.tile(shared[0], (len(shared), 1)), atol=1e-6)
+    assert 0.1 < -shared[0, 0] < 0.7, "between the two"

@@ -289,9 +289,9 @@ class _Prim:
         self.mesh.CreateVelocitiesAttr().Set(_vectors((after - before) / seconds), time)
         self.mesh.CreateExtentAttr().Set(_vectors(np.array([local.min(axis=0), local.max(axis=0)])), time)
         if self.shading is not None:
-            attribute, shading = self.shading
+            attribute, shading, rows = self.shading
             normals = shading.normals(local) * self.outward
-            attribute.Set(_vectors(normals if shading.groups is shading.corners else normals[shading.groups]), time)
+            attribute.Set(_vectors(normals if rows is None else normals[rows]), time)
 
     def _local(self, positions: np.ndarray, code: float) -> np.ndarray:
         """(p, 3) in the prim's own coordinates at a time."""
@@ -306,9 +306,9 @@ class _Prim:
         return bound if self.upright else np.column_stack([bound[:, 0], -bound[:, 2], bound[:, 1]])
 
 
-def _authored_shading(prim, begin: float) -> "tuple[Any, Shading] | None":
-    """The attribute that has a mesh's normals and which corners share one; None where it has none. Other than by corner or vertex, they
-    are blocked: they would be wrong.
+def _authored_shading(prim, begin: float) -> "tuple[Any, Shading, np.ndarray | None] | None":
+    """The attribute that has a mesh's normals, which corners share one, and of which group each of its values is (None: one of each, in
+    order); None where it has none. Normals of another kind than by corner, vertex or face are blocked: they would be wrong.
     """
     from pxr import Usd, UsdGeom
 
@@ -316,17 +316,20 @@ def _authored_shading(prim, begin: float) -> "tuple[Any, Shading] | None":
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     if primvar and primvar.HasValue():
         attribute, how, values = primvar.GetAttr(), primvar.GetInterpolation(), np.array(primvar.ComputeFlattened(first))
-        indexed = primvar.IsIndexed()
+        if primvar.IsIndexed():  # faces that shared a normal may not for long
+            primvar.BlockIndices()
     else:
-        attribute, how, indexed = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation(), False
+        attribute, how = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation()
         values = np.array(attribute.Get(first)) if attribute and attribute.HasValue() else None
     if values is None or not prim.IsA(UsdGeom.Mesh):
         return None
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(first), dtype=np.int64)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(first), dtype=np.int64)
-    if how in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and not indexed:
-        return attribute, Shading(corners, counts, corners)
-    if how != UsdGeom.Tokens.faceVarying or indexed or len(values) != len(corners):
+    if how in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        return attribute, Shading(corners, counts, corners), None
+    if how == UsdGeom.Tokens.uniform:
+        return attribute, Shading(corners, counts, np.repeat(np.arange(len(counts)), counts)), None
+    if how != UsdGeom.Tokens.faceVarying or len(values) != len(corners):
         attribute.Block()
         return None
     groups, count = np.full(len(corners), -1), 0
@@ -335,7 +338,7 @@ def _authored_shading(prim, begin: float) -> "tuple[Any, Shading] | None":
         alike = values[own] @ values[own].T > SAME_NORMAL
         label = connected_components(scipy.sparse.csr_array(alike), directed=False)[1]
         groups[own], count = count + label, count + label.max() + 1
-    return attribute, Shading(corners, counts, groups)
+    return attribute, Shading(corners, counts, groups), groups
 
 
 def _prims_of(
