@@ -213,3 +213,20 @@ def test_normals_follow_in_whichever_way_they_are_given(how):
     shared = found[x[:, 0] == 0]
     np.testing.assert_allclose(shared, np.tile(shared[0], (len(shared), 1)), atol=1e-6)
     assert 0.1 < -shared[0, 0] < 0.7, "between the two"
+
+
+def test_a_package_is_read_and_written_over_but_not_written(tmp_path):
+    """shot.usdz: one file of what make() has made; the layer over it has the points of the run."""
+    from pxr import UsdUtils
+
+    make(tmp_path, 24.0)
+    assert UsdUtils.CreateNewUsdzPackage(str(tmp_path / "shot.usda"), str(tmp_path / "packed.usdz"))
+    (tmp_path / "scene.toml").write_text(SCENE.format(step=1 / 24).replace("shot.usda", "packed.usdz"))
+    pdipc.run_scene(pdipc.load_scene(tmp_path / "scene.toml"), tmp_path / "run", device="cpu")
+    run = open_run(tmp_path / "run")
+    stage = Usd.Stage.Open(str(export(run, "stage", tmp_path / "cache.usda")))
+    assert (UsdGeom.GetStageUpAxis(stage), stage.GetStartTimeCode()) == ("Z", START)
+    x = run.positions(FRAMES)[run.topology["body_of_vertex"] == 0]
+    np.testing.assert_allclose(in_world(stage, "/World/Set/Flag", START + FRAMES), x, atol=SINGLE)
+    with pytest.raises(ValueError, match="a USD file that is written ends in one of"):
+        export(run, "usd", tmp_path / "out.usdz")

@@ -16,6 +16,7 @@ from pdipc.scene.files.foreign import usd_meshes, usd_start
 from pdipc.scene.meshes import USD_SUFFIXES, split_prim
 from pdipc.scene.motion import rotation_matrix
 
+WRITTEN = (".usd", ".usda", ".usdc")
 WHOLE = 1e-6  # rates and time codes that are nearer than this part to a whole number, or to a rate of film and television, are meant to be it
 SAME_PLACE = 1e-5  # of a body's size: a point of the stage and a vertex that are no further apart are the same
 NEIGHBOURS = 12  # tets near a point among which the one that it is in is looked for
@@ -193,8 +194,8 @@ def _vectors(values: np.ndarray):
 
 
 def _usd_name(path: Path) -> None:
-    if path.suffix.lower() not in USD_SUFFIXES:
-        raise ValueError(f'"{path}": a USD file ends in one of: {", ".join(USD_SUFFIXES)}')
+    if path.suffix.lower() not in WRITTEN:
+        raise ValueError(f'"{path}": a USD file that is written ends in one of: {", ".join(WRITTEN)}')
 
 
 def _identifier(name: str, body: int) -> str:
