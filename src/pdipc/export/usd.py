@@ -337,7 +337,7 @@ def _authored_shading(prim, begin: float) -> "tuple[Any, Shading, np.ndarray | N
     order = np.argsort(corners, kind="stable")
     for own in np.split(order, np.flatnonzero(np.diff(corners[order])) + 1):
         alike = values[own] @ values[own].T > SAME_NORMAL
-        label = connected_components(scipy.sparse.csr_array(alike), directed=False)[1]
+        label = connected_components(scipy.sparse.csr_matrix(alike.astype(np.int8)), directed=False)[1]
         groups[own], count = count + label, count + label.max() + 1
     return attribute, Shading(corners, counts, groups), groups
 

@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -124,7 +125,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, mat33 = real.scalar, real.mat33
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -150,7 +151,7 @@ def kernels(real: Real) -> SimpleNamespace:
         total[2, 2] = total[2, 2] + c
         values_out[e] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather_diagonal(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -167,7 +168,7 @@ def kernels(real: Real) -> SimpleNamespace:
         total[2, 2] = total[2, 2] + held[i]
         diagonal_out[i] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrain(
         first: int,
         body: wp.array(dtype=wp.int32),

@@ -119,7 +119,9 @@ class SolverPDIPC(SolverBase):
         mask = self._normalize_reset_world_mask(world_mask)
         model, wanted = self.model, newton.StateFlags
         flags = -1 if flags is None else int(flags)
-        chosen = np.ones(model.particle_count, dtype=bool) if mask is None else mask.numpy()[_read(model, "particle_world")]
+        chosen = np.ones(model.particle_count, dtype=bool)
+        if mask is not None:
+            chosen = _numpy(mask)[_read(model, "particle_world")]
         for flag, name in ((wanted.PARTICLE_Q, "particle_q"), (wanted.PARTICLE_QD, "particle_qd")):
             if flags & int(flag):
                 values = _read(state, name).copy()
@@ -286,6 +288,10 @@ class SolverPDIPC(SolverBase):
 def _read(of: newton.State | newton.Model, name: str) -> np.ndarray:
     """An array that is there, on the host; on the CPU a view."""
     return getattr(of, name).numpy()
+
+
+def _numpy(array: wp.array) -> np.ndarray:
+    return array.numpy()
 
 
 def _write(to: newton.State, name: str, values: np.ndarray) -> None:

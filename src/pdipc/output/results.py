@@ -443,7 +443,8 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    _write(path, lambda file: np.savez(file, **{name: np.asarray(array) for name, array in arrays.items()}))
+    named: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    _write(path, lambda file: np.savez(file, **named))
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:

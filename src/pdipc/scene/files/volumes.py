@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def msh(path: Path) -> Contents:
     if head is None:
         raise Damaged("it does not begin with $MeshFormat of version 2 or 4.1")
     version, binary, size = head[1].decode("ascii"), head[2] == b"1", int(head[3])
-    order = "<"
+    order: Literal["<", ">"] = "<"
     if binary and int.from_bytes(data[head.end() : head.end() + 4], "little") != 1:
         order = ">"
     if binary and size not in (4, 8):
@@ -170,8 +171,9 @@ class _Words:
 class _Bytes:
     """What a section says as bytes, from its begin on."""
 
-    def __init__(self, data: bytes, name: str, order: str, size: str):
-        self.data, self.at, self.name, self.order, self.size = data, 0, name, order, size
+    def __init__(self, data: bytes, name: str, order: Literal["<", ">"], size: str):
+        self.data, self.at, self.name, self.size = data, 0, name, size
+        self.order: Literal["<", ">"] = order
 
     def take(self, kind: str | list, count: int) -> np.ndarray:
         dtype = np.dtype(kind).newbyteorder(self.order)

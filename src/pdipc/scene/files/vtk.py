@@ -67,9 +67,10 @@ def _sort(found: Contents, kinds: np.ndarray, corners: np.ndarray, ends: np.ndar
             elif kind != 0:
                 found.notes.append(f"{len(rows)} cells of VTK's kind {kind} were left out")
     if polygons:
-        found.polygons = tuple(
+        corners, counts = (
             np.concatenate([old, *new]) for old, new in zip(found.polygons, zip(*polygons, strict=True), strict=True)
         )
+        found.polygons = corners, counts
 
 
 # --- legacy ---
