@@ -137,7 +137,7 @@ def usd_meshes(root, first) -> tuple[list, dict[str, int], int]:
     prims, others, hidden = [], {}, 0
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
         kind = str(prim.GetTypeName())
-        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
+        if not UsdGeom.Gprim(prim) and kind not in ("PointInstancer", "Skeleton"):
             continue
         purpose = UsdGeom.Imageable(prim).ComputePurpose()
         if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
