@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import io
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,8 @@ def by_meshio(path: Path) -> Contents:
 def glb(path: Path) -> Contents:
     import trimesh
 
+    text = _glb_head(path)
+    fans = _glb_fans(json.loads(text)) if text else 0
     scene = trimesh.load_scene(path, process=False)
     kinds = {name: type(geometry).__name__ for name, geometry in scene.geometry.items()}
     points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
@@ -67,13 +70,46 @@ def glb(path: Path) -> Contents:
             count += len(mesh.vertices)
     if others:
         notes.append(f"{len(others)} lines or clouds of points were left out")
-    head = path.read_bytes()[:20]
-    length = int.from_bytes(head[12:16], "little") if head[:4] == b"glTF" else 0
-    text = path.read_bytes()[20 : 20 + length]
-    moving = [name for name in ("skins", "animations", "targets") if f'"{name}"'.encode() in text]
+    if fans:
+        notes.append(f"{fans} fans of triangles were left out; write them as triangles")
+    moving = [name for name in ("skins", "animations", "targets", "EXT_mesh_gpu_instancing") if f'"{name}"'.encode() in text]
     if moving:
         notes.append(f"{' and '.join(moving)} were left out: the mesh is as it stands without them")
     return Contents(np.concatenate(points), [("triangle", np.concatenate(triangles))], notes=notes, repeats=True)
+
+
+GLB_MODES = {None, 0, 1, 2, 3, 4, 5}  # of what is drawn: triangles, strips of them, lines and points; not fans
+GLB_KNOWN = re.compile(
+    r"KHR_(materials|texture|lights|mesh_quantization|xmp)\w*|EXT_texture\w*"
+)  # that a file may require, as places hold without
+
+
+def _glb_head(path: Path) -> bytes:
+    """The JSON of a .glb; nothing where it is none."""
+    with open(path, "rb") as file:
+        head = file.read(20)
+        return file.read(int.from_bytes(head[12:16], "little")) if head[:4] == b"glTF" and head[16:20] == b"JSON" else b""
+
+
+def _glb_fans(tree: dict) -> int:
+    """How many primitives are fans. Raises Damaged for what trimesh would read as something else without a word: places that an extension
+    packs, that are sparse, or that are fractions of the largest whole number.
+    """
+    required = [name for name in tree.get("extensionsRequired", []) if not GLB_KNOWN.fullmatch(name)]
+    if required:
+        raise Damaged(f"it requires the extension {required[0][:60]}, which is not read; write it without")
+    accessors, fans = tree.get("accessors", []), 0
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh.get("primitives", []):
+            fans += primitive.get("mode") not in GLB_MODES
+            for which in (primitive.get("attributes", {}).get("POSITION"), primitive.get("indices")):
+                if which is None:
+                    continue
+                if "sparse" in accessors[which]:
+                    raise Damaged(f"its accessor {which} is sparse, which is not read; write it in full")
+                if accessors[which].get("normalized"):
+                    raise Damaged(f"its accessor {which} is normalized, which is not read for places; write them as float")
+    return fans
 
 
 def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
@@ -90,8 +126,10 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     root = stage.GetPseudoRoot() if below is None else _usd_prim(stage, path, below)
     prims, others, hidden = usd_meshes(root, first)
     found = Contents(np.zeros((0, 3)))
+    broken = _usd_broken(stage)
     if not prims:
-        raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh')
+        said = "".join(f"; {each}" for each in broken)
+        raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh{said}')
     convert, said = _units(stage)
     found.points = convert(_usd_points(prims, first))
     corners, counts, size = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
@@ -112,7 +150,7 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     if frames and len(times) > 1:
         found.frames = np.stack([convert(_usd_points(prims, Usd.TimeCode(time))) for time in times])
         found.times = np.array(times) / stage.GetTimeCodesPerSecond()
-    found.notes += said
+    found.notes += said + broken
     if others:
         listed = ", ".join(f"{number} {kind}" for kind, number in sorted(others.items()))
         found.notes.append(f"prims were left out: {listed}")
@@ -121,6 +159,14 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     if len(times) > 1 and not frames:
         found.notes.append(_first_of(len(times)))
     return found
+
+
+def _usd_broken(stage) -> list[str]:
+    """A note where other files that the stage names are not there, or cannot be read: what they hold is not in it."""
+    errors = stage.GetCompositionErrors()
+    if not errors:
+        return []
+    return [f"{len(errors)} parts of the stage could not be put together: {' '.join(str(errors[0]).split())[:200]}"]
 
 
 def usd_start(stage) -> float:
