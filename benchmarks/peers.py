@@ -263,10 +263,14 @@ def main() -> None:
         times = {"processor": recorder.processor, "wall": recorder.wall}
         np.savez(options.out, frames=np.array(recorder.frames), missed=missed, memory=memory, **times)
         return
+    info = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     report = {
-        "machine": platform.machine(),
+        "machine": next((line.split(":")[1].strip() for line in info if "model name" in line), platform.processor()),
         "cores": os.cpu_count(),
         "date": time.strftime("%Y-%m-%d"),
+        "commit": subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent
+        ).stdout.strip(),
         "newton": {"iterations": options.iterations, "substeps": options.substeps, "radius": RADIUS, "stiffness": STIFFNESS},
         "rows": [],
     }

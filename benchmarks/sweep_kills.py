@@ -1,8 +1,9 @@
 """A sweep of 24 runs on two workers of this machine, one of which is killed on the way, beside the same sweep in one process:
 `python benchmarks/sweep_kills.py`.
 
-Prints, and writes to benchmarks/results/sweep_kills.json, whether the two tables are the same file, from which step the killed run went
-on, and the processor time and wall time of each.
+The kill hits a run in its middle, between a quarter and three quarters of its steps. Prints, and writes to
+benchmarks/results/sweep_kills.json, whether the two tables are the same file, the last step of the killed run when it was killed, the step from
+which it went on, and the processor time and wall time of each.
 """
 
 import csv
@@ -44,7 +45,8 @@ SETTINGS = {
     "bodies.ball.material.young_modulus": [1e4, 1e5, 1e6],
     "bodies.sheet.material.bending_stiffness": [1e-6, 1e-4],
 }
-CHECKPOINT_SECONDS = 0.2  # in the workers: runs are short
+STEPS = 24  # of SCENE
+CHECKPOINT_SECONDS = 0.1  # in the workers: runs are short
 
 
 def often() -> None:
@@ -54,17 +56,27 @@ def often() -> None:
     simulation.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
 
 
-def kill_one(folder: Path, killed: list) -> None:
-    """Ends, once a third of the runs are whole, the process of a run that has taken 4 steps."""
+def frames_of(run: Path) -> int:
+    """The last step of which a run has a frame; -1 before there is any."""
+    return max((int(path.stem) for path in (run / "frames").glob("*.npy")), default=-1)
+
+
+def kill_one(folder: Path, killed: list[tuple[str, int]]) -> None:
+    """Ends, once a third of the runs are whole, the process of a run that is in its middle. The process is halted first, so that the run is no
+    further when it ends than when it was looked at.
+    """
     while not killed:
-        whole = [path for path in folder.glob("*/frames/000024.npy")]
+        whole = list(folder.glob(f"*/frames/{STEPS:06d}.npy"))
         for lock in folder.glob("*/run.lock") if len(whole) >= 8 else ():
             words = re.match(r"process (\d+) on", lock.read_text())
-            done = [(lock.parent / "frames" / name).exists() for name in ("000004.npy", "000024.npy")]
-            if words and done == [True, False]:
+            if not words or not STEPS // 4 <= frames_of(lock.parent) < STEPS // 2:
+                continue
+            os.kill(int(words[1]), signal.SIGSTOP)
+            if lock.exists() and STEPS // 4 <= (step := frames_of(lock.parent)) <= 3 * STEPS // 4:
                 os.kill(int(words[1]), signal.SIGKILL)
-                killed.append(lock.parent.name)
+                killed.append((lock.parent.name, step))
                 return
+            os.kill(int(words[1]), signal.SIGCONT)
         time.sleep(0.005)
 
 
@@ -79,7 +91,7 @@ def main() -> None:
             assert outcome == 0, outcome
         sweeps.write_table(serial, cases, {})
         alone = time.perf_counter() - begun, time.process_time() - processor
-        killed: list[str] = []
+        killed: list[tuple[str, int]] = []
         with LocalCluster(n_workers=2, threads_per_worker=1, memory_limit=0, dashboard_address=None) as cluster:
             from distributed import Client
 
@@ -98,13 +110,16 @@ def main() -> None:
             "load": os.getloadavg()[0],
             "runs": len(cases),
             "failures": failures,
-            "killed": killed,
-            "resumed_at_step": [resumed[name] for name in killed],
+            "steps": STEPS,
+            "killed": [name for name, _ in killed],
+            "killed_at_step": [step for _, step in killed],
+            "resumed_at_step": [resumed[name] for name, _ in killed],
             "same_table": (serial / "table.csv").read_bytes() == (swept / "table.csv").read_bytes(),
             "serial_wall_s": alone[0],
             "serial_processor_s": alone[1],
             "two_workers_wall_s": together,
         }
+    assert killed, "no run was seen in its middle"
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(report, indent=1) + "\n")
     print(json.dumps(report))

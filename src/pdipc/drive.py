@@ -139,7 +139,13 @@ def _result(model: Model, state: State, work: Work, report: list[float], into: S
     ignoring, left = work.quarantine.names(state.quarantined), state.quarantined
     if ignoring:
         left = work.quarantine.left(work.x.numpy().astype(np.float64), left)
-    new = into or State(*(wp.empty_like(each) for each in (work.x, work.v, work.a, work.rest)), reached)
+    new = into or State(
+        positions=wp.empty_like(work.x),
+        velocities=wp.empty_like(work.v),
+        accelerations=wp.empty_like(work.a),
+        remainders=wp.empty_like(work.rest),
+        reached=reached,
+    )
     wp.copy(new.positions, work.x)
     wp.copy(new.velocities, work.v)
     wp.copy(new.accelerations, work.a)

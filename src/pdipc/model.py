@@ -174,13 +174,21 @@ class Model:
             return wp.array(np.asarray(arrays[name]), dtype=self.real.vec3, device=self.device.warp)
 
         arrays = {"remainders": np.zeros_like(arrays["positions"]), **arrays}  # files of earlier versions have none
-        vectors = [upload(name) for name in ("positions", "velocities", "accelerations", "remainders")]
         time = float(arrays["time"])
         reached = Reached.from_arrays(arrays) if "reached_times" in arrays else Reached.at(time, self.assembly)
         quarantined = tuple(
             bool(is_one) for is_one in arrays.get("quarantined", np.ones(len(self.assembly.quarantine), dtype=bool))
         )
-        return State(*vectors, reached, quarantined, time=time, step=int(arrays.get("step", 0)))
+        return State(
+            positions=upload("positions"),
+            velocities=upload("velocities"),
+            accelerations=upload("accelerations"),
+            remainders=upload("remainders"),
+            reached=reached,
+            quarantined=quarantined,
+            time=time,
+            step=int(arrays.get("step", 0)),
+        )
 
     def set_time(self, time: float) -> None:
         """Uploads what a script says of `time`, s: how long threads are, and what closed sheets hold."""
@@ -297,7 +305,7 @@ def _linear_solver(scene: Scene, system: System) -> Solver:
     sim, name = scene.simulation, scene.simulation.linear_solver
     if name == "auto":
         name = DEFAULT_SOLVER["cuda" if system.device.is_cuda else "cpu"][scene.contact.method]
-    options = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
+    options: dict[str, float] = {"order": sim.solver_order} if name in ("a-jacobi", "matrix-powers") else {}
     if name == "a-jacobi":
         options["drop"] = sim.solver_drop
     return make_solver(name, system, tolerance=sim.linear_tolerance, max_iterations=sim.linear_iterations, **options)
@@ -320,7 +328,7 @@ def _per_vertex(scene: Scene, assembly: Assembly, mass: np.ndarray, free: np.nda
         found["half_separation"][own] = body.half_separation
         if body.kind == "rod":
             found["rest_separation"][own] = ROD_SEPARATION
-        if not body.kinematic:
+        if body.material is not None:
             typical = mass[own].sum() / body.count if len(body.handles) else mass[own].mean()
             found["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
             found["body_mass"][own] = mass[own].sum()

@@ -15,9 +15,10 @@ from pdipc.audit.contact import collect, mean
 from pdipc.control.commands import Controls
 from pdipc.control.phases import model_at
 from pdipc.device.launch import Graph, one_at_a_time, replayed
-from pdipc.drive import StepResult, Work, stepping
+from pdipc.drive import StepResult, stepping
 from pdipc.model import Model, State, build
 from pdipc.scene.schema import Scene
+from pdipc.work import Work
 
 if TYPE_CHECKING:
     from pdipc.output.results import Run, RunWriter
@@ -216,8 +217,17 @@ def run_scene(
 
     if progress is True:
         with bar_of_steps(scene.simulation.steps if steps is None else steps) as advance:
-            options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
-            return run_scene(scene, out_dir, steps=steps, device=device, progress=advance, **options)
+            return run_scene(
+                scene,
+                out_dir,
+                steps=steps,
+                device=device,
+                resume=resume,
+                overwrite=overwrite,
+                certify=certify,
+                forces=forces,
+                progress=advance,
+            )
     begun = begun_run(scene, out_dir) if resume else None
     if begun is not None:
         device = device or begun.meta.get("device")
@@ -232,7 +242,7 @@ def begun_run(scene: Scene, folder: str | Path) -> "Run":
     from pdipc.output.results import RunError, open_run
 
     begun = open_run(folder)
-    if where := _first_difference(*(_without_steps(each) for each in (Scene.model_validate(begun.scene), scene))):
+    if where := _first_difference(_without_steps(Scene.model_validate(begun.scene)), _without_steps(scene)):
         raise RunError(f"{folder} holds a run of another scene ({where} differs); resume it with its own scene and options")
     return begun
 
@@ -267,12 +277,12 @@ def _without_steps(scene: Scene) -> dict[str, Any]:
 def _first_difference(a: Any, b: Any, path: str = "") -> str | None:
     """The key of the first value that differs, such as "bodies[0].material.density"; None where all are the same."""
     if isinstance(a, dict) and isinstance(b, dict):
-        inner = ((f"{path}.{name}" if path else name, a.get(name), b.get(name)) for name in sorted({*a, *b}))
+        inner = ((f"{path}.{name}" if path else str(name), a.get(name), b.get(name)) for name in sorted({*a, *b}))
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
-        inner = ((f"{path}[{i}]", *both) for i, both in enumerate(zip(a, b, strict=True)))
+        inner = ((f"{path}[{i}]", mine, other) for i, (mine, other) in enumerate(zip(a, b, strict=True)))
     else:
         return None if a == b else path
-    return next(filter(None, (_first_difference(*values, where) for where, *values in inner)), None)
+    return next(filter(None, (_first_difference(mine, other, where) for where, mine, other in inner)), None)
 
 
 def running(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator
 import numpy as np
 import warp as wp
 
+from pdipc.barrier.pairs import ActivePairs, FrozenPairs
 from pdipc.barrier.restitution import ELASTIC_END, ELASTIC_START, Restitution
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.candidates import Candidates
@@ -77,14 +78,14 @@ class Work:
         self.truncation.keep_rigid(self.script.rigid())
         self.method: Method = METHODS[settings.nonlinear_solver](self)
         self.restitution = None
-        if settings.restitution is not None and settings.method == "barrier":
+        if settings.restitution is not None and isinstance(self.method.pairs, ActivePairs):
             masses = (model.mass, model.free, model.body_mass, model.rigidity)
             self.restitution = Restitution(device, real, self.method.pairs, *masses, settings.restitution, settings.time_step)
         self._graphs: dict[str, Graph] = {}
         self._graphs_of = (-1, -1, -1)
 
     @property
-    def pairs(self):
+    def pairs(self) -> FrozenPairs:
         """The barriers that were listed last."""
         return self.method.pairs
 

@@ -15,6 +15,7 @@ from collision import exact
 from pdipc.collision import broad_phase, candidates, ccd, moving_boxes, sieve, surface
 from pdipc.device.launch import Device
 from pdipc.device.precision import kernel, real
+from pdipc.judge import witness
 
 KINDS = ("vertex_triangle", "edge_edge")
 PRECISIONS = ("float64", "float32")
@@ -270,3 +271,87 @@ def unlisted(x0, x1, triangles, reach, precision, method):
         out = quads[apart & left[i, j]]
         found.append((np.concatenate([x0[out], x1[out]], axis=1), int(apart.sum())))
     return found
+
+
+# --- what the witness decides without whole numbers ---
+
+
+def segments(family, precision, rng, n):
+    """(n, 5, 3): the ends of a segment, and a triangle of the family: the segment crosses it, ends on it but for rounding, within or on its rim,
+    or lies in its plane.
+    """
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        points = family(rng, n)[:, :4]
+        n, corners = len(points), points[:, 1:]
+
+        def aim():
+            weights = rng.dirichlet(np.ones(3), n)
+            weights[rng.random((n, 3)) < 0.25] = 0.0  # the rim, and corners
+            weights /= np.maximum(weights.sum(axis=1), 1e-300)[:, None]
+            beyond = rng.choice([1.0, 1.0, 2.0, -1.5], n)[:, None]  # in the plane, but outside of it
+            return np.einsum("nk,nki->ni", weights, corners - corners[:, :1]) * beyond + corners[:, 0]
+
+        which = rng.random(n)[:, None]
+        begin = np.where(which < 0.7, points[:, 0], aim())
+        target = aim()
+        end = target + np.where(rng.random(n) < 0.5, 0.0, rng.uniform(0.0, 1.5, n))[:, None] * (target - begin)
+        result = np.concatenate([begin[:, None], end[:, None], corners], axis=1).astype(precision)
+        ulps = rng.choice([0, 0, 0, 1, -1], (n, 2, 3))
+        result[:, :2] = np.where(ulps == 0, result[:, :2], np.nextafter(result[:, :2], (np.inf * ulps).astype(precision)))
+        result = result.astype(float)
+        return result[np.isfinite(result).all(axis=(1, 2)) & (np.abs(result).max(axis=(1, 2)) < 1e300)]
+
+
+def crossing(points):
+    """(n,) bool: what the witness says of segments and triangles (n, 5, 3)."""
+    n = len(points)
+    vertices, own = np.arange(5 * n).reshape(n, 5), np.column_stack([np.arange(n)] * 2)
+    found = witness.edge_triangle_crossings(points.reshape(-1, 3), vertices[:, :2], vertices[:, 2:], [own])
+    result = np.zeros(n, dtype=bool)
+    result[found[:, 0]] = True
+    return result
+
+
+def wrongly_crossing(points, said):
+    """Indices of the segments and triangles (n, 5, 3) of which it is not true that they meet, or do not, as `said` has it.
+
+    Extended precision proves what it can, with a margin far above its rounding; whole numbers decide the rest.
+    """
+    proven = np.zeros(len(points), dtype=int)
+    if np.finfo(np.longdouble).maxexp >= 1 << 14:  # where it has no more range than float64, products would overflow
+        for part in np.array_split(np.arange(len(points)), max(1, len(points) // 20_000)):
+            proven[part] = _meet(points[part].astype(np.longdouble))
+    wrong = np.where(said, proven < 0, proven > 0)
+    for i in np.flatnonzero(proven == 0):
+        wrong[i] = witness.segment_meets_triangle(*points[i]) != said[i]
+    return np.flatnonzero(wrong)
+
+
+def _meet(points):
+    """(n,) 1: the segment surely meets the triangle, -1: surely does not; 0: in doubt."""
+    p, q, *corners = points.transpose(1, 0, 2)
+    margin = exact.MARGIN * np.finfo(points.dtype).eps
+
+    def side(a, b, c, d):
+        u, v, w = b - a, c - a, d - a
+        volume = np.einsum("ni,ni->n", w, np.cross(u, v))
+        u, v, w = np.abs(u), np.abs(v), np.abs(w)
+        room = margin * np.einsum("ni,ni->n", w, np.roll(u, -1, 1) * np.roll(v, 1, 1) + np.roll(u, 1, 1) * np.roll(v, -1, 1))
+        return np.where(np.abs(volume) > room, np.sign(volume), 0).astype(int)
+
+    above = [side(*corners, end) for end in (p, q)]
+    around = np.array([side(p, q, corners[k], corners[k - 2]) for k in range(3)])
+    through = above[0] * above[1] < 0
+    meet = through & (np.abs(around.sum(axis=0)) == 3)
+    apart = (above[0] * above[1] > 0) | ((around.min(axis=0) < 0) & (around.max(axis=0) > 0))
+    # a direction across an edge and an axis on which all of the one is before all of the other, for what lies in a plane
+    edges = [q - p, *(corners[k] - corners[k - 1] for k in range(3))]
+    differences = points[:, 2:, None] - points[:, None, :2]
+    size = margin * np.abs(differences).max(axis=(1, 2, 3))
+    for edge in edges:
+        for axis in np.eye(3, dtype=points.dtype):
+            n = np.cross(edge, axis)
+            along = np.einsum("ni,nkji->nkj", n, differences)
+            room = size * np.abs(n).sum(axis=1)
+            apart |= (along.min(axis=(1, 2)) > room) | (along.max(axis=(1, 2)) < -room)
+    return meet.astype(int) - apart

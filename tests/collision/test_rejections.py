@@ -8,6 +8,7 @@ import pytest
 
 from collision import hard_queries, rejections
 from pdipc.collision import candidates, sieve
+from pdipc.judge import witness
 
 FAMILIES = hard_queries.FAMILIES + hard_queries.CULLING
 
@@ -93,3 +94,23 @@ def test_what_counts_as_near_is_near(precision):
     assert not len(rejections.not_near(x, y, margin, near))
     assert len(rejections.not_near(x, y, margin, np.ones(len(x), dtype=bool))) > 100  # the judge has eyes
     assert not near[margin <= candidates.LEAST_MARGIN].any()
+
+
+@pytest.mark.parametrize("precision", rejections.PRECISIONS)
+def test_the_witness_is_right_about_segments_and_triangles(precision, monkeypatch):
+    """What it decides in floating point as well: its judge sees where it errs."""
+    points = np.concatenate(
+        [rejections.segments(family, precision, np.random.default_rng(k), 60) for k, family in enumerate(FAMILIES)]
+    )
+    said = rejections.crossing(points)
+    assert 0.1 < said.mean() < 0.9
+    assert not len(rejections.wrongly_crossing(points, said))
+    exactly = np.array([witness.segment_meets_triangle(*five) for five in points])
+    np.testing.assert_array_equal(
+        rejections.wrongly_crossing(points, np.zeros(len(points), dtype=bool)), np.flatnonzero(exactly)
+    )
+    np.testing.assert_array_equal(
+        rejections.wrongly_crossing(points, np.ones(len(points), dtype=bool)), np.flatnonzero(~exactly)
+    )
+    monkeypatch.setattr(witness, "ORIENT3D_ERROR", 0.0)
+    assert len(rejections.wrongly_crossing(points, rejections.crossing(points)))

@@ -282,6 +282,114 @@ def test_changes_of_the_model_are_taken_over():
     np.testing.assert_allclose(after.particle_qd.numpy()[:, 2] - before, 2.0 * H, atol=1e-5)
 
 
+def test_masses_materials_and_pins_of_the_model_are_taken_over_in_flight():
+    b = builder()
+    cloth(b, z=1.0)
+    block(b, z=2.0)
+    solver = solver_of(b)
+    now, _ = run(solver, 3)
+    model, after = solver.model, solver.model.state()
+    mass = 2.0 * model.particle_mass.numpy()
+    mass[:4] = 0.0
+    model.particle_mass.assign(mass)
+    table = model.tet_materials.numpy().copy()
+    table[:, :2] *= 3.0
+    model.tet_materials.assign(table)
+    solver.notify_model_changed(newton.ModelFlags.ALL)
+    held = now.particle_q.numpy()[:4].copy()
+    f = np.zeros((model.particle_count, 3), dtype=np.float32)
+    f[16:, 0] = mass[16:]  # 1 m/s^2 for the masses of now
+    now.particle_f.assign(f)
+    before = now.particle_qd.numpy().copy()
+    solver.step(now, after, None, None, H)
+    np.testing.assert_array_equal(after.particle_q.numpy()[:4], held)
+    gained = after.particle_qd.numpy()[16:] - before[16:]
+    np.testing.assert_allclose(gained, np.tile([H, 0, -G * H], (len(gained), 1)), atol=1e-4)
+    solid = solver._made.scene.bodies[1].material
+    assert solid.young_modulus / (2 * (1 + solid.poisson_ratio)) == pytest.approx(3.0 * MU)
+
+
+def test_a_change_that_cannot_be_taken_over_changes_nothing():
+    """A shape grows through the cloth: refused with its name, and the steps after it are those without it."""
+    finals = []
+    for refused in (False, True):
+        b = builder()
+        table = b.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.1), I), is_kinematic=True, mass=1.0)
+        b.add_shape_box(table, hx=0.1, hy=0.1, hz=0.1)
+        cloth(b, z=0.25, cells=4)
+        solver = solver_of(b)
+        now, _ = run(solver, 10)
+        if refused:
+            solver.model.shape_scale.assign(np.array([[0.1, 0.1, 0.3]], dtype=np.float32))
+            with pytest.raises(SceneError, match=r'"cloth_0" and obstacle "body_0"'):
+                solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        after = solver.model.state()
+        for _ in range(5):
+            solver.step(now, after, None, None, H)
+            now, after = after, now
+        finals.append(now.particle_q.numpy().copy())
+    np.testing.assert_array_equal(*finals)
+
+
+def test_the_two_states_may_be_one():
+    finals = []
+    for same in (False, True):
+        b = builder()
+        b.add_ground_plane()
+        cloth(b, z=0.02)
+        solver = solver_of(b)
+        now = solver.model.state()
+        after = now if same else solver.model.state()
+        for _ in range(8):
+            solver.step(now, after, solver.model.control(), None, H)
+            now, after = after, now
+        finals.append(now.particle_q.numpy().copy())
+    np.testing.assert_array_equal(*finals)
+
+
+def test_time_steps_that_differ_every_time_do_not_fill_the_memory():
+    b = builder()
+    block(b, z=1.0)
+    solver = solver_of(b)
+    state, v = solver.model.state(), 0.0
+    for k in range(20):
+        solver.step(state, state, None, None, H * (1 + 0.01 * k))
+        v -= G * H * (1 + 0.01 * k)
+    assert state.particle_qd.numpy()[:, 2] == pytest.approx(v, rel=1e-4)
+    assert len(solver._simulations) <= 8
+
+
+MOVING = {
+    "plane": lambda b, body: b.add_shape_plane(xform=wp.transform_identity(), body=body, width=0.5, length=0.5),
+    "sphere": lambda b, body: b.add_shape_sphere(body, radius=0.1),
+    "box": lambda b, body: b.add_shape_box(body, hx=0.1, hy=0.15, hz=0.05),
+    "capsule": lambda b, body: b.add_shape_capsule(body, radius=0.06, half_height=0.08),
+    "cylinder": lambda b, body: b.add_shape_cylinder(body, radius=0.1, half_height=0.08),
+    "cone": lambda b, body: b.add_shape_cone(body, radius=0.15, half_height=0.1),
+    "ellipsoid": lambda b, body: b.add_shape_ellipsoid(body, rx=0.15, ry=0.1, rz=0.05),
+    "mesh": lambda b, body: b.add_shape_mesh(body, mesh=newton.Mesh.create_box(0.1, 0.1, 0.1)),
+    "convex mesh": lambda b, body: b.add_shape_convex_hull(body, mesh=newton.Mesh.create_box(0.1, 0.1, 0.1)),
+}
+
+
+@pytest.mark.parametrize("kind", MOVING)
+def test_shapes_of_every_kind_that_rise_and_turn_lift_a_cloth(kind):
+    b = builder()
+    body = b.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.3), I), is_kinematic=True, mass=1.0)
+    MOVING[kind](b, body)
+    cloth(b, z=0.46, cells=4)
+    solver = solver_of(b)
+
+    def lift(k, state):
+        q = state.body_q.numpy().copy()
+        q[0] = 0.002 * k, 0.0, 0.3 + 0.01 * k, *wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.05 * k)
+        state.body_q.assign(q)
+
+    now, states = run(solver, 20, lift)
+    assert intersections(solver, states[-1]) == 0 and solver.result.converged and solver.result.lag == 0.0
+    assert now.particle_q.numpy()[:, 2].max() > 0.49, "it would have fallen by 0.2 m"
+
+
 def dynamic(b):
     cloth(b)
     b.add_shape_sphere(b.add_body(label="ball"), radius=0.1)
@@ -357,6 +465,16 @@ def test_what_would_do_nothing_or_go_wrong_is_refused():
     control.tri_activations.fill_(1.0)
     with pytest.raises(Unsupported, match="tri_activations"):
         solver.step(state, state, control, None, H)
+    control.tri_activations.zero_()
+    moving = builder()
+    cloth(moving)
+    moving.add_shape_sphere(moving.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.3), I), is_kinematic=True), radius=0.1)
+    lost = solver_of(moving)
+    for nowhere in (np.nan, 0.0):
+        state = lost.model.state()
+        state.body_q.fill_(wp.transform(wp.vec3(0.0), wp.quat(nowhere, nowhere, nowhere, nowhere)))
+        with pytest.raises(ValueError, match=r"body_q\[0\].*no place and turn"):
+            lost.step(state, state, None, None, H)
     with pytest.raises(ValueError, match="time_step comes from Newton"):
         SolverPDIPC(solver.model, simulation={"time_step": 0.1})
     with pytest.raises(ValueError, match="float32 of Newton's states"):

@@ -7,9 +7,11 @@ import os
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -423,6 +425,86 @@ def test_damaged_frames_are_named(tmp_path):
         np.save(tmp_path / "run/frames/000001.npy", array)
         with pytest.raises(RunError, match=said):
             open_run(tmp_path / "run").positions(1)
+
+
+def of_huge_arrays(path, name) -> None:
+    """An archive of an array that says it has 22 TiB."""
+    head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 3)}\n"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
+
+
+def with_bits(path, flag: int = 0, packed: int | None = None) -> None:
+    """An archive of which the first member says that it is encrypted, flag 1, or packed in a way of another number."""
+    data = bytearray(path.read_bytes())
+    central = data.find(b"PK\x01\x02")
+    for at in (6, central + 8):
+        data[at] |= flag
+        data[at + 2] = data[at + 2] if packed is None else packed
+    path.write_bytes(data)
+
+
+ODD = {
+    "encrypted": lambda path, name: with_bits(path, flag=1),
+    "packed in another way": lambda path, name: with_bits(path, packed=99),
+    "of huge arrays": of_huge_arrays,
+    "another kind of file": lambda path, name: path.write_bytes((path.parent.parent / "frames/000001.npy").read_bytes()),
+    "a folder": lambda path, name: (path.unlink(), path.mkdir()),
+    "a link to itself": lambda path, name: (path.unlink(), path.symlink_to(path.name)),
+    "a pipe": lambda path, name: (path.unlink(), os.mkfifo(path)),
+}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes and links of other systems")
+@pytest.mark.parametrize("odd", ODD)
+def test_files_that_are_something_else_are_named(tmp_path, odd):
+    """Whatever reading them raises, or however long it would wait."""
+    folder = tmp_path / "run"
+    writer, state = runs.begin(folder)
+    with writer:
+        runs.advance(writer, state, range(1, 5))
+    run = open_run(folder)
+    ODD[odd](folder / "segments/000004_0000.npz", "start")
+    with pytest.raises(RunError, match=r"000004_0000\.npz cannot be read: .{5}") as caught:
+        list(run.segments())
+    assert len(str(caught.value)) < len(str(folder)) + 400
+    ODD[odd](folder / "checkpoints/000004.npz", "positions")
+    with RunWriter.resume(folder) as writer:
+        assert writer.latest_checkpoint()[0] == 2, "the one before is whole"
+    if odd != "another kind of file":
+        ODD[odd](folder / "topology.npz", "triangles")
+        with pytest.raises(RunError, match=r"topology\.npz cannot be read: .{5}"):
+            open_run(folder)
+
+
+def test_frames_that_are_something_else_are_named(tmp_path):
+    runs.write(tmp_path / "run", steps=1)
+    path = tmp_path / "run/frames/000001.npy"
+    head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 3)}\n"
+    for data, said in (
+        (b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head, "it needs more memory than there is"),
+        ((tmp_path / "run/topology.npz").read_bytes(), "it holds several arrays"),
+        (
+            b"\x93NUMPY\x01\x00" + struct.pack("<H", 8001) + b"(" * 4000 + b")" * 4000 + b"\n",
+            "Cannot parse header|too many nested",
+        ),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(RunError, match=rf"000001\.npy cannot be read: ({said})") as caught:
+            open_run(tmp_path / "run").positions(1)
+        assert len(str(caught.value)) < len(str(tmp_path)) + 400
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of other systems")
+def test_folders_that_cannot_be_are_refused(tmp_path):
+    long = tmp_path / ("y" * 5000)
+    with pytest.raises(RunError, match=r"y\.\.\. cannot be written: File name too long"):
+        runs.begin(long)
+    with pytest.raises(RunError, match=r"cannot be read: .*File name too long"):
+        open_run(long)
+    os.mkfifo(tmp_path / "run.lock")
+    with pytest.raises(RunError, match=r"run\.lock cannot be written: it is no regular file"):
+        runs.begin(tmp_path)
 
 
 def test_frames_without_a_line_and_lines_without_a_frame(tmp_path):

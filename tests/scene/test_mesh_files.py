@@ -1,7 +1,10 @@
 """What mesh files hold comes out whole: areas, volumes and counts that follow from the files; what does not is said."""
 
+import base64
+import json
 import struct
 import time
+import zlib
 
 import meshio
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 
 from pdipc.scene import cells, generators, meshes, worker
 from pdipc.scene.errors import SceneError
+from pdipc.scene.files import surfaces
 
 QUAD_AND_TRIANGLES = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 1], [1, 0, 1], [2, 0, 1]], dtype=float)
 
@@ -378,7 +382,7 @@ def test_usd_that_moves_or_has_no_unit_is_said(tmp_path):
     assert mesh.vertices[:, 2] == pytest.approx(1.0)
     assert mesh.notes == [
         "it does not say metersPerUnit: its numbers were taken as m",
-        "it moves or deforms at 2 times: it was read as it is at the first",
+        "it moves or deforms at 2 times: it was read as it is at the start",
     ]
 
 
@@ -494,6 +498,202 @@ def test_a_glb_says_what_it_leaves_out(tmp_path):
     mesh = meshes.read(tmp_path / "a.glb")
     assert (len(mesh.vertices), area(mesh)) == (16, pytest.approx(12.0))
     assert mesh.notes == ["1 lines or clouds of points were left out"]
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+SQUARE_OFF = "OFF\n4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n"
+TRIANGLE_MEDIT = "MeshVersionFormatted 2\nDimension 3\nVertices 3\n0 0 0 0\n1 0 0 0\n0 2 0 0\nTriangles 1\n1 2 3 0\n"
+
+
+@pytest.mark.parametrize("coding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.obj", SQUARE + "f 1 2 3 4\n"), ("a.off", SQUARE_OFF), ("a.mesh", TRIANGLE_MEDIT)]
+)
+def test_marks_that_editors_put_before_a_text_cost_no_vertex(tmp_path, name, text, coding):
+    (tmp_path / name).write_text(text.replace("\n", "\r\n"), encoding=coding, newline="")
+    mesh = meshes.read(tmp_path / name)
+    assert (area(mesh), mesh.notes) == (pytest.approx(1.0), [])
+
+
+def test_only_line_ends_end_the_lines_of_an_obj(tmp_path):
+    """Not what Python also takes for one, such as the marks of old printers in the name of a group."""
+    (tmp_path / "a.obj").write_text(SQUARE + "g one\x85f 1 2 3\ng two\u2028v 9 9 9\x0cf 1 2 3\nf 1 2 3 4\n", encoding="utf-8")
+    mesh = meshes.read(tmp_path / "a.obj")
+    assert (len(mesh.vertices), area(mesh)) == (4, pytest.approx(1.0))
+
+
+LOOP = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\n{}endloop\nendfacet\n"
+
+
+def test_stl_with_a_vertex_in_its_name_and_with_loops_of_four(tmp_path):
+    (tmp_path / "a.stl").write_text(f"solid my outer vertex\n{LOOP.format('')}endsolid my outer vertex\n")
+    assert area(meshes.read(tmp_path / "a.stl")) == pytest.approx(0.5)
+    (tmp_path / "a.stl").write_text("solid " + LOOP.format("").replace("\n", " ") + "endsolid")
+    assert area(meshes.read(tmp_path / "a.stl")) == pytest.approx(0.5)
+    (tmp_path / "a.stl").write_text("solid four\n" + 3 * LOOP.format("vertex 0 1 0\n") + "endsolid four\n")
+    with pytest.raises(SceneError, match="holds 12 vertices in 3 loops; needed: three in each"):
+        meshes.read(tmp_path / "a.stl")
+
+
+def test_elements_of_a_ply_that_are_no_faces_are_said(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"element {name} 1\nproperty list uchar int vertex_indices\n" for name in ("tet", "face")) + "end_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n" + 2 * "4 0 1 2 3\n")
+    mesh = meshes.read(tmp_path / "a.ply")
+    assert (area(mesh), mesh.notes) == (pytest.approx(1.0), ["1 elements of the kind tet were left out"])
+
+
+TETS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 1 1")  # volumes 1/6 and 1/3
+
+
+@pytest.mark.parametrize("numbers", [(0, 1, 2, 3, 4), (1, 2, 3, 4, 5), (3, 1, 5, 2, 4), (10, 20, 30, 40, 50)])
+@pytest.mark.parametrize("attributes", [0, 7])
+def test_nodes_of_tetgen_go_by_their_numbers(tmp_path, numbers, attributes):
+    (tmp_path / "a.node").write_text("5 3 0 0\n" + "".join(f"{k} {x}\n" for k, x in zip(numbers, TETS, strict=True)))
+    rows = [" ".join(str(numbers[k]) for k in tet) + attributes * " 9" for tet in ((0, 1, 2, 3), (1, 2, 3, 4))]
+    (tmp_path / "a.ele").write_text(f"2 4 {attributes}\n1 {rows[0]}\n2 {rows[1]}\n")
+    mesh = meshes.read(tmp_path / "a.ele")
+    assert (volume(mesh), mesh.notes) == (pytest.approx(0.5), [])
+    (tmp_path / "a.ele").write_text(f"1 4 0\n1 {numbers[0]} {numbers[1]} {numbers[2]} 99\n")
+    with pytest.raises(SceneError, match="a tet names node 99, which is not there"):
+        meshes.read(tmp_path / "a.ele")
+
+
+@pytest.mark.parametrize("parametric", [False, True])
+@pytest.mark.parametrize("binary", [False, True])
+def test_gmsh_4_0(tmp_path, binary, parametric):
+    """Where the numbers of nodes and elements stand in another order than in 4.1."""
+    points = [[float(x) for x in row.split()] + [0.5, 0.5] * parametric for row in TETS]
+    tets = [(1, 1, 2, 3, 4), (2, 2, 3, 4, 5)]
+    if binary:
+        nodes = struct.pack("<2Q3iQ", 1, 5, 1, 2, int(parametric), 5)
+        nodes += b"".join(struct.pack(f"<i{len(row)}d", k, *row) for k, row in enumerate(points, 1))
+        elements = struct.pack("<2Q3iQ", 1, 2, 1, 3, 4, 2) + b"".join(struct.pack("<5i", *row) for row in tets)
+        head = b"4 1 8\n" + struct.pack("<i", 1)
+    else:
+        nodes = f"1 5\n1 2 {int(parametric)} 5\n" + "\n".join(" ".join(map(str, [k, *row])) for k, row in enumerate(points, 1))
+        elements = "1 2\n1 3 4 2\n" + "\n".join(" ".join(map(str, row)) for row in tets)
+        nodes, elements, head = nodes.encode(), elements.encode(), b"4 0 8"
+    parts = [(b"MeshFormat", head), (b"Nodes", nodes), (b"Elements", elements)]
+    (tmp_path / "a.msh").write_bytes(b"".join(b"$%s\n%s\n$End%s\n" % (name, inside, name) for name, inside in parts))
+    assert volume(meshes.read(tmp_path / "a.msh")) == pytest.approx(0.5)
+
+
+def test_gmsh_with_two_tables_of_elements_is_not_read_by_half(tmp_path):
+    table = "$Elements\n1\n1 4 2 0 1 {}\n$EndElements\n"
+    nodes = "$Nodes\n5\n" + "".join(f"{k} {x}\n" for k, x in enumerate(TETS, 1)) + "$EndNodes\n"
+    text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + nodes + table.format("1 2 3 4") + table.format("2 3 4 5")
+    (tmp_path / "a.msh").write_text(text)
+    with pytest.raises(SceneError, match=r"more than one \$Elements"):
+        meshes.read(tmp_path / "a.msh")
+
+
+def test_cells_of_third_order_of_medit_are_said(tmp_path):
+    (tmp_path / "a.mesh").write_text(TRIANGLE_MEDIT + "TrianglesP3 2\n" + 2 * "1 2 3 1 2 3 1 2 3 1 0\n" + "End\n")
+    mesh = meshes.read(tmp_path / "a.mesh")
+    assert (area(mesh), mesh.notes) == (pytest.approx(1.0), ["2 cells of the kind trianglesp3 were left out"])
+
+
+@pytest.mark.parametrize("values", [np.eye(3) * 1j, np.zeros((3, 3), "M8[s]"), np.eye(3).astype(str), np.eye(3, dtype=bool)])
+def test_archives_of_other_things_than_numbers(tmp_path, values):
+    np.savez(tmp_path / "a.npz", V=values, F=np.array([[0, 1, 2]]))
+    with pytest.raises(SceneError, match=r"V holds .*; it must hold real numbers"):
+        meshes.read(tmp_path / "a.npz")
+
+
+def test_archives_that_need_more_memory_than_there_is(tmp_path, monkeypatch):
+    """What is packed into little counts, too."""
+    np.savez_compressed(tmp_path / "a.npz", V=np.zeros((1_000_000, 3)), F=np.array([[0, 1, 2]]))
+    assert (tmp_path / "a.npz").stat().st_size < 100_000
+    monkeypatch.setattr(surfaces, "free_memory", lambda: 50_000_000)
+    with pytest.raises(SceneError, match=r"needs about 0\.0894 GiB of memory, and 0\.0466 GiB are free"):
+        meshes.read(tmp_path / "a.npz")
+
+
+def test_a_vtu_that_unpacks_to_too_much_is_not_unpacked(tmp_path):
+    block, count = zlib.compress(bytes(1 << 24)), 200
+    packed = base64.b64encode(struct.pack(f"<{3 + count}Q", count, 1 << 24, 0, *[len(block)] * count)) + base64.b64encode(
+        block * count
+    )
+    array = f'<DataArray type="Float64" NumberOfComponents="3" format="binary">{packed.decode()}</DataArray>'
+    (tmp_path / "a.vtu").write_text(
+        '<VTKFile type="UnstructuredGrid" byte_order="LittleEndian" header_type="UInt64" compressor="vtkZLibDataCompressor">'
+        f"<UnstructuredGrid><Piece><Points>{array}</Points></Piece></UnstructuredGrid></VTKFile>"
+    )
+    with pytest.raises(SceneError, match=r"a DataArray would unpack to 3\.12 GiB"):
+        meshes.read(tmp_path / "a.vtu")
+
+
+def glb(path, primitives: list[dict], **more) -> None:
+    """A unit square in the plane of x and y, and indices 0, 1, 2, 0, 2, 3, in a file with these primitives."""
+    places, indices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4"), np.array([0, 1, 2, 0, 2, 3], "<u4")
+    tree = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, **each} for each in primitives]}],
+        "buffers": [{"byteLength": places.nbytes + indices.nbytes}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": places.nbytes},
+            {"buffer": 0, "byteOffset": places.nbytes, "byteLength": indices.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 0]},
+            {"bufferView": 1, "componentType": 5125, "count": 6, "type": "SCALAR"},
+        ],
+    }
+    for name, change in more.items():
+        tree[name] = change(tree[name]) if callable(change) else change
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    data = places.tobytes() + indices.tobytes()
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def test_primitives_of_a_glb(tmp_path):
+    pytest.importorskip("trimesh")
+    glb(tmp_path / "a.glb", [{"indices": 1}])
+    mesh = meshes.read(tmp_path / "a.glb")
+    assert (area(mesh), mesh.notes) == (pytest.approx(1.0), [])
+    glb(tmp_path / "a.glb", [{"indices": 1}, {"mode": 6}], extensionsRequired=["KHR_materials_unlit"])
+    mesh = meshes.read(tmp_path / "a.glb")
+    assert (area(mesh), mesh.notes) == (pytest.approx(1.0), ["1 fans of triangles were left out; write them as triangles"])
+    glb(tmp_path / "a.glb", [{"indices": 1}], nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}])
+    assert any("EXT_mesh_gpu_instancing were left out" in note for note in meshes.read(tmp_path / "a.glb").notes)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "requires the extension KHR_draco_mesh_compression"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "requires the extension EXT_meshopt_compression"),
+        ({"accessors": lambda given: [{**given[0], "sparse": {"count": 1}}, given[1]]}, "its accessor 0 is sparse"),
+        ({"accessors": lambda given: [{**given[0], "normalized": True}, given[1]]}, "its accessor 0 is normalized"),
+    ],
+)
+def test_glbs_whose_places_would_be_read_wrongly(tmp_path, more, said):
+    pytest.importorskip("trimesh")
+    glb(tmp_path / "a.glb", [{"indices": 1}], **more)
+    with pytest.raises(SceneError, match=said):
+        meshes.read(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("what", ["references", "payload"])
+def test_parts_of_a_stage_that_are_not_there_are_said(tmp_path, what):
+    pytest.importorskip("pxr", reason='the extra "usd" is not installed')
+    mesh = "int[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 1, 2]\npoint3f[] points = [(0, 0, 0), (1, 0, 0), (0, 0, 1)]"
+    lost = f'def Xform "lost" ({what} = @not_there.usda@)\n{{\n}}\n'
+    (tmp_path / "a.usda").write_text(f'#usda 1.0\n(\nmetersPerUnit = 1\n)\ndef Mesh "m"\n{{\n{mesh}\n}}\n{lost}')
+    mesh = meshes.read(tmp_path / "a.usda")
+    assert area(mesh) == pytest.approx(0.5)
+    assert (
+        len(mesh.notes) == 1
+        and "1 parts of the stage could not be put together: Could not open asset @not_there" in mesh.notes[0]
+    )
+    (tmp_path / "a.usda").write_text(f"#usda 1.0\n{lost}")
+    with pytest.raises(SceneError, match=r"holds no Mesh; 1 parts .* Could not open asset @not_there\.usda@"):
+        meshes.read(tmp_path / "a.usda")
 
 
 # --- the process that reads what others parse ---

@@ -151,6 +151,28 @@ def test_a_killed_worker_is_replaced_and_its_run_goes_on(scene, tmp_path):
     assert smooth == pytest.approx(0.5 * 0.08, rel=0.02) and rough < 0.7 * smooth
 
 
+def test_a_run_goes_on_from_its_last_checkpoint_and_says_which(scene, tmp_path, monkeypatch):
+    """Of five steps that are there when it was stopped, those after the checkpoint are taken again."""
+    from pdipc import simulation
+
+    (case,) = sweeps.combinations(scene, {"contact.friction": [0.0]})
+    own, told, seconds = tmp_path / case.folder, simulation.stats_of, [10.0]
+
+    def until_the_sixth(result):
+        seconds.append(0.0 if len(seconds) == 3 else 10.0)
+        monkeypatch.setattr(simulation, "CHECKPOINT_SECONDS", seconds[-1])
+        if len(seconds) == 7:
+            raise RuntimeError("stopped")
+        return told(result)
+
+    monkeypatch.setattr(simulation, "stats_of", until_the_sixth)
+    assert sweeps.run_case(case, str(tmp_path)) == "stopped"
+    assert open_run(own).records[-1]["step"] == 5
+    monkeypatch.setattr(simulation, "stats_of", told)
+    assert sweeps.run_case(case, str(tmp_path)) == 3
+    assert open_run(own).records[-1]["step"] == 8
+
+
 def test_what_cannot_be_simulated_is_refused_before_anything_runs(scene, tmp_path, inside):
     settings = {"bodies.block.translation": [[0, 0.0505, 0], [0, 0.02, 0], [0, 0.01, 0]]}
     with pytest.raises(SceneError) as caught:
@@ -158,7 +180,7 @@ def test_what_cannot_be_simulated_is_refused_before_anything_runs(scene, tmp_pat
     said = str(caught.value)
     assert "2 of 3 combinations cannot be simulated" in said
     assert "bodies.block.translation = [0, 0.02, 0]: the scene cannot be simulated" in said and "floor" in said
-    assert not (tmp_path / "swept" / "0000").exists()
+    assert not (tmp_path / "swept").exists(), "another sweep may have the name"
 
 
 def test_a_sweep_that_was_stopped_is_finished(scene, tmp_path, inside):

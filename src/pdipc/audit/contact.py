@@ -51,16 +51,23 @@ def mean(forces: Sequence[ContactForces]) -> ContactForces:
     b, last, share = len(forces[0].names), forces[-1], 1.0 / len(forces)
     keys = np.concatenate([each.pairs[:, 0].astype(np.int64) * b + each.pairs[:, 1] for each in forces])
     present, rows = np.unique(keys, return_inverse=True)
-    sums = (
-        share * _added(rows, np.concatenate([getattr(each, name) for each in forces]), len(present))
-        for name in ("normal", "friction", "torque")
+
+    def summed(name: str) -> np.ndarray:
+        return share * _added(rows, np.concatenate([getattr(each, name) for each in forces]), len(present))
+
+    def at_vertices(name: str) -> np.ndarray | None:
+        return None if getattr(last, name) is None else np.mean([getattr(each, name) for each in forces], axis=0)
+
+    return ContactForces(
+        names=last.names,
+        pairs=np.column_stack(np.divmod(present, b)).astype(np.int32),
+        normal=summed("normal"),
+        friction=summed("friction"),
+        torque=summed("torque"),
+        centers=last.centers,
+        vertex_normal=at_vertices("vertex_normal"),
+        vertex_friction=at_vertices("vertex_friction"),
     )
-    vertices = (
-        None if getattr(last, name) is None else np.mean([getattr(each, name) for each in forces], axis=0)
-        for name in ("vertex_normal", "vertex_friction")
-    )
-    pairs = np.column_stack(np.divmod(present, b)).astype(np.int32)
-    return ContactForces(last.names, pairs, *sums, last.centers, *vertices)
 
 
 def _added(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from pdipc.barrier.pairs import ActivePairs
 from pdipc.device.launch import one_at_a_time
 from pdipc.model import Model, State
 from pdipc.work import Work
@@ -67,4 +68,5 @@ def barrier_forces(model: Model, state: State, work: Work) -> np.ndarray:
             "in the paper's mode forces belong to a step, not to a state: run with --forces, or step with forces=True"
         )
     work.list_pairs(state.positions)
+    assert isinstance(work.pairs, ActivePairs)
     return work.pairs.forces(state.positions).numpy().astype(np.float64)

@@ -20,6 +20,7 @@ import warp as wp
 from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
+from pdipc.device.language import Kernel, func, kernel, struct_of
 from pdipc.device.launch import Largest, Span
 from pdipc.device.precision import Real
 from pdipc.linear import contact_rows
@@ -34,11 +35,11 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
 
-    @wp.func
+    @func
     def row(m: mat43, s: int) -> vec3:
         return vec3(m[s, 0], m[s, 1], m[s, 2])
 
-    @wp.func
+    @func
     def free_directions(a: vec4, edges: bool):
         """da/dt of the parameters of the witness points that are not at an end."""
         d1 = vec4()
@@ -65,7 +66,7 @@ def kernels(real: Real) -> SimpleNamespace:
         return d1, d2
 
     # Long: energy, gradient and Hessian of a pair, which share all that is computed of it.
-    @wp.kernel(module=module)
+    @kernel(module)
     def differentiate(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -209,7 +210,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 lever_out[k] = lever
                 hessian_out[k] = hessian
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def measure_bend(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -241,7 +242,7 @@ def kernels(real: Real) -> SimpleNamespace:
             result = wp.abs(then - now) / wp.max(now, one)
         change_out[k] = result
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -282,7 +283,7 @@ def kernels(real: Real) -> SimpleNamespace:
         energy_out[v] = own
 
     # Arguments: a pair as it is frozen, and where its part goes.
-    @wp.func
+    @func
     def feel(
         k: int,
         p: wp.array(dtype=vec3),
@@ -322,7 +323,7 @@ def kernels(real: Real) -> SimpleNamespace:
             work += response[2] * bent
         return response, across, work
 
-    @wp.func
+    @func
     def exert(
         v: int,
         ends: wp.array(dtype=wp.int32),
@@ -346,7 +347,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += response[k][1] * row(first_bent[k], s) + response[k][2] * row(second_bent[k], s)
         return total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def stretch(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -372,7 +373,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 response_out[k] = response
                 across_out[k] = across
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread(
         first: int,
         free: wp.array(dtype=scalar),
@@ -498,23 +499,25 @@ def operator(real: Real) -> Operator:
     k_of = kernels(real)
     mat43, feel_pair, row, total_share = k_of.mat43, k_of.feel, k_of.row, pairs.total_share(real)
 
-    @wp.struct
-    class Operand:
-        count: wp.array(dtype=wp.int32)
-        quads: wp.array(dtype=wp.vec4i)
-        weights: wp.array(dtype=vec4)
-        normals: wp.array(dtype=vec3)
-        lever: wp.array(dtype=mat43)
-        hessian: wp.array(dtype=scalar)
-        bend: wp.array(dtype=scalar)
-        first_bent: wp.array(dtype=mat43)
-        second_bent: wp.array(dtype=mat43)
-        project: wp.array(dtype=wp.int32)
-        ends: wp.array(dtype=wp.int32)
-        places: wp.array(dtype=wp.int32)
-        shares: wp.array(dtype=vec3)
+    Operand = struct_of(
+        "Operand",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        quads=wp.array(dtype=wp.vec4i),
+        weights=wp.array(dtype=vec4),
+        normals=wp.array(dtype=vec3),
+        lever=wp.array(dtype=mat43),
+        hessian=wp.array(dtype=scalar),
+        bend=wp.array(dtype=scalar),
+        first_bent=wp.array(dtype=mat43),
+        second_bent=wp.array(dtype=mat43),
+        project=wp.array(dtype=wp.int32),
+        ends=wp.array(dtype=wp.int32),
+        places=wp.array(dtype=wp.int32),
+        shares=wp.array(dtype=vec3),
+    )
 
-    @wp.func
+    @func
     def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
         response, across, work = feel_pair(
             k,
@@ -537,7 +540,7 @@ def operator(real: Real) -> Operator:
             o.shares[o.places[4 * k + s]] = share
         return work
 
-    @wp.func
+    @func
     def exert(o: Operand, v: int) -> vec3:
         return total_share(v, o.ends, o.shares)
 
@@ -545,12 +548,12 @@ def operator(real: Real) -> Operator:
 
 
 @functools.cache
-def assembly(real: Real) -> wp.Kernel:
+def assembly(real: Real) -> Kernel:
     """The kernel that fills the rows of the Hessian."""
     mat33, row, Operand = real.mat33, kernels(real).row, operator(real).Operand
     identity = wp.constant(mat33(1, 0, 0, 0, 1, 0, 0, 0, 1))
 
-    @wp.func
+    @func
     def block_of(o: Operand, k: int, s: int, t: int) -> mat33:
         block = o.hessian[k] * wp.outer(row(o.lever[k], s), row(o.lever[k], t))
         if o.project[0] == 0 and o.bend[k] > real.scalar(0.0):
@@ -564,7 +567,7 @@ def assembly(real: Real) -> wp.Kernel:
 
 
 @functools.cache
-def wide_coupling(real: Real) -> wp.Kernel:
+def wide_coupling(real: Real) -> Kernel:
     """`coupling` with a block of threads a pair of groups."""
     from pdipc.linear import wide_modes
 
@@ -573,7 +576,7 @@ def wide_coupling(real: Real) -> wp.Kernel:
     row, mat43 = k_of.row, k_of.mat43
     wide = wp.float64
 
-    @wp.func
+    @func
     def block_of(k: int, s: int, t: int, lever: wp.array(dtype=mat43), hessian: wp.array(dtype=scalar)) -> wp.mat33d:
         a = row(lever[k], s)
         b = row(lever[k], t)
@@ -585,7 +588,7 @@ def wide_coupling(real: Real) -> wp.Kernel:
 
 
 @functools.cache
-def coupling(real: Real) -> wp.Kernel:
+def coupling(real: Real) -> Kernel:
     """The kernel that adds rank-one terms of pairs to the matrix of rigid modes, a group of vertices a worker."""
     from pdipc.linear import rigid_modes
 
@@ -593,7 +596,7 @@ def coupling(real: Real) -> wp.Kernel:
     f, k_of = rigid_modes.functions(real), kernels(real)
     row, mat43, _vec6 = k_of.row, k_of.mat43, f.vec6
 
-    @wp.kernel(module=real.module(f"{__name__}.coupling"))
+    @kernel(real.module(f"{__name__}.coupling"))
     def couple(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -632,4 +635,4 @@ def coupling(real: Real) -> wp.Kernel:
                     if other >= 0 and (other < low[g] or g < low[wp.max(other, 0)]):
                         f.add_outer(c, size, g, g, h, own, own)
 
-    return couple  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return couple

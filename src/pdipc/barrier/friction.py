@@ -14,6 +14,7 @@ from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
+from pdipc.device.language import Kernel, func, kernel, struct_of
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real
 from pdipc.linear import contact_rows
@@ -27,7 +28,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def copy(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -55,7 +56,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 for s in range(4):
                     entries_out[4 * k + s] = entries[4 * k + s]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def copy_ends(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -68,7 +69,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if i == 0:
             count_out[0] = count[0]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def copy_places(
         span: Span, count: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32), places_out: wp.array(dtype=wp.int32)
     ):
@@ -78,12 +79,12 @@ def kernels(real: Real) -> SimpleNamespace:
                 for s in range(4):
                     places_out[4 * k + s] = places[4 * k + s]
 
-    @wp.func
+    @func
     def slip(q: wp.vec4i, a: vec4, n: vec3, u: wp.array(dtype=vec3)) -> vec3:
         s = a[0] * u[q[0]] + a[1] * u[q[1]] + a[2] * u[q[2]] + a[3] * u[q[3]]
         return s - wp.dot(n, s) * n
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def evaluate(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -122,7 +123,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     h += (along - rate) * wp.outer(t, t)
                 block_out[k] = h
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -161,7 +162,7 @@ def kernels(real: Real) -> SimpleNamespace:
         diagonal_out[v] = d
         energy_out[v] = own
 
-    @wp.func
+    @func
     def feel(
         k: int,
         p: wp.array(dtype=vec3),
@@ -176,7 +177,7 @@ def kernels(real: Real) -> SimpleNamespace:
         response = block[k] * s
         return response, wp.dot(response, s)
 
-    @wp.func
+    @func
     def exert(
         v: int,
         ends: wp.array(dtype=wp.int32),
@@ -191,7 +192,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += weights[k][entries[i] % 4] * response[k]
         return total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def stretch(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -207,7 +208,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 response, _work = feel(k, p, quads, weights, block)
                 response_out[k] = response
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread(
         first: int,
         free: wp.array(dtype=scalar),
@@ -326,24 +327,26 @@ def operator(real: Real) -> Operator:
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     feel_pair, total_share = kernels(real).feel, pairs.total_share(real)
 
-    @wp.struct
-    class Operand:
-        count: wp.array(dtype=wp.int32)
-        quads: wp.array(dtype=wp.vec4i)
-        weights: wp.array(dtype=vec4)
-        block: wp.array(dtype=mat33)
-        ends: wp.array(dtype=wp.int32)
-        places: wp.array(dtype=wp.int32)
-        shares: wp.array(dtype=vec3)
+    Operand = struct_of(
+        "Operand",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        quads=wp.array(dtype=wp.vec4i),
+        weights=wp.array(dtype=vec4),
+        block=wp.array(dtype=mat33),
+        ends=wp.array(dtype=wp.int32),
+        places=wp.array(dtype=wp.int32),
+        shares=wp.array(dtype=vec3),
+    )
 
-    @wp.func
+    @func
     def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
         response, work = feel_pair(k, p, o.quads, o.weights, o.block)
         for s in range(4):
             o.shares[o.places[4 * k + s]] = o.weights[k][s] * response
         return work
 
-    @wp.func
+    @func
     def exert(o: Operand, v: int) -> vec3:
         return total_share(v, o.ends, o.shares)
 
@@ -351,11 +354,11 @@ def operator(real: Real) -> Operator:
 
 
 @functools.cache
-def assembly(real: Real) -> wp.Kernel:
+def assembly(real: Real) -> Kernel:
     """The kernel that fills the rows of the Hessian."""
     Operand = operator(real).Operand
 
-    @wp.func
+    @func
     def block_of(o: Operand, k: int, s: int, t: int) -> real.mat33:
         return (o.weights[k][s] * o.weights[k][t]) * o.block[k]
 
@@ -363,14 +366,14 @@ def assembly(real: Real) -> wp.Kernel:
 
 
 @functools.cache
-def wide_coupling(real: Real) -> wp.Kernel:
+def wide_coupling(real: Real) -> Kernel:
     """`coupling` with a block of threads a pair of groups."""
     from pdipc.linear import wide_modes
 
     vec4, mat33 = real.vec4, real.mat33
     wide, widened = wp.float64, wide_modes.functions(real).widened
 
-    @wp.func
+    @func
     def block_of(k: int, s: int, t: int, weights: wp.array(dtype=vec4), block: wp.array(dtype=mat33)) -> wp.mat33d:
         return (wide(weights[k][s]) * wide(weights[k][t])) * widened(block[k])
 
@@ -378,14 +381,14 @@ def wide_coupling(real: Real) -> wp.Kernel:
 
 
 @functools.cache
-def coupling(real: Real) -> wp.Kernel:
+def coupling(real: Real) -> Kernel:
     """As in `exact`, for terms of rank two."""
     from pdipc.linear import rigid_modes
 
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     f = rigid_modes.functions(real)
 
-    @wp.kernel(module=real.module(f"{__name__}.coupling"))
+    @kernel(real.module(f"{__name__}.coupling"))
     def couple(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -428,4 +431,4 @@ def coupling(real: Real) -> wp.Kernel:
                         if outside:
                             f.add_outer(c, size, g, g, one, own, f.mode(arms[v], a * unit))
 
-    return couple  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return couple

@@ -23,8 +23,9 @@ import warp as wp
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
 from pdipc.collision.candidates import SILENT, Candidates
+from pdipc.device.language import Function, func, kernel
 from pdipc.device.launch import Device, Reducer, Span
-from pdipc.device.precision import Real, kernel
+from pdipc.device.precision import Real
 
 FIRST_PAIRS = 1024  # room at first
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
@@ -38,7 +39,7 @@ def kernels(real: Real) -> SimpleNamespace:
     least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
     silent = wp.constant(SILENT)
 
-    @wp.func
+    @func
     def vertex_triangle_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
         p = x[q[0]]
         a = x[q[1]]
@@ -50,7 +51,7 @@ def kernels(real: Real) -> SimpleNamespace:
         w = vec4(distance.vertex_triangle_weights(p, a, b, c))
         return wp.length(w[0] * (p - a) + w[2] * (b - a) + w[3] * (c - a)) - limits[0]
 
-    @wp.func
+    @func
     def edge_edge_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
         a0 = x[q[0]]
         a1 = x[q[1]]
@@ -62,7 +63,7 @@ def kernels(real: Real) -> SimpleNamespace:
         w = vec4(distance.edge_edge_weights(a0, a1, b0, b1))
         return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
 
-    @wp.func
+    @func
     def foreseen(
         gap: scalar, q: wp.vec4i, a: vec4, limits: vec2, x: wp.array(dtype=vec3), ahead: wp.array(dtype=vec3)
     ) -> scalar:
@@ -123,7 +124,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
         return measure_gaps
 
-    @wp.func
+    @func
     def nearest_of_face(
         k: int,
         count: int,
@@ -148,7 +149,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         j += step
         return nearest
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def claim(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -168,7 +169,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         active += 1
             active_out[begin // span.block] = active
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def total(
         first: int,
         ends_a: wp.array(dtype=wp.int32),
@@ -261,11 +262,11 @@ def kernels(real: Real) -> SimpleNamespace:
 
         return freeze_pairs
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, values_out: wp.array(dtype=wp.int32)):
         values_out[first + wp.tid()] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def count_incident(
         span: Span, count: wp.array(dtype=wp.int32), quads: wp.array(dtype=wp.vec4i), degree: wp.array(dtype=int)
     ):
@@ -275,7 +276,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 for s in range(4):
                     wp.atomic_add(degree, quads[k][s], 1)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def fill_incident(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -292,7 +293,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     left = wp.atomic_add(degree, v, -1)
                     entries_out[ends[v] - left] = k * 4 + s
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sort_incident(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -319,7 +320,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     sorted_out[low + before] = k * 4 + s
                     place_out[k * 4 + s] = low + before
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def linearize(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -362,7 +363,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 friction_out[k] = friction
                 force_out[k] = force
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -398,7 +399,7 @@ def kernels(real: Real) -> SimpleNamespace:
             rhs[v] = rhs[v] + total
         diagonal_out[v] = d
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def stretch(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -419,7 +420,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 u = a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]]
                 response_out[k] = (hessian[k] - friction[k]) * wp.dot(n, u) * n + friction[k] * u
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -438,7 +439,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += weights[entries[i] // 4][entries[i] % 4] * response[entries[i] // 4]
             y[v] = y[v] + total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def pair_energy(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -472,11 +473,11 @@ def kernels(real: Real) -> SimpleNamespace:
 
 
 @functools.cache
-def total_share(real: Real) -> wp.Function:
+def total_share(real: Real) -> Function:
     """What vertex v gets of its pairs, each of which has put its share in its place in the list of the vertex."""
     vec3 = real.vec3
 
-    @wp.func
+    @func
     def total(v: int, ends: wp.array(dtype=wp.int32), shares: wp.array(dtype=vec3)) -> vec3:
         low = int(0)
         if v > 0:
@@ -486,7 +487,7 @@ def total_share(real: Real) -> wp.Function:
             total_of_vertex += shares[i]
         return total_of_vertex
 
-    return total  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return total
 
 
 @dataclass
@@ -499,8 +500,8 @@ class Exerted:
     forces: np.ndarray
 
 
-class ActivePairs:
-    """The barriers and friction of one outer iteration, and the contact operator that the linear solver applies.
+class FrozenPairs:
+    """The pairs of one outer iteration.
 
     kappa: (n,) barrier stiffness that a vertex brings to its pairs, N/m, 0 for kinematic vertices.
     friction: (n,) Coulomb coefficient; a pair has the geometric mean of its two sides. slip_threshold: eps_v h in metres.
@@ -513,10 +514,8 @@ class ActivePairs:
         self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
         self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; most found; of these vertex-triangle
         self.closest = wp.zeros(2, dtype=real.scalar, device=device.warp)  # smallest gap of each kind, negative, m
-        self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
-        self.scalar = None  # the paper mode's scalar diagonal; this mode couples the vertices of a pair instead
         self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
         self._allocate(FIRST_PAIRS)
 
@@ -589,6 +588,29 @@ class ActivePairs:
             inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries, self.places]
             device.launch_list(k.sort_incident, self.capacity, inputs)
 
+    def listed(self, *arrays: wp.array) -> list[np.ndarray]:
+        """The entries in use of arrays with one a pair, numbers as float64."""
+        return listed(int(self.count.numpy()[0]), *arrays)
+
+    def energy(self, out: wp.array, slot: int) -> None:
+        """out[slot] = sum of kappa m b(d0) over the pairs, in joules. Recordable."""
+        self.device.launch(
+            self.kernels.pair_energy,
+            self.capacity,
+            [self.count, self.gaps, self.activation, self.stiffness, self.energies],
+        )
+        self.energy_sum.sum(self.energies, out, slot)
+
+
+class ActivePairs(FrozenPairs):
+    """Their barriers and friction, and the contact operator that the linear solver applies. diagonal: (n,) 3x3 blocks, kg/s^2."""
+
+    scalar = None  # the paper mode's diagonal; this mode couples the vertices of a pair instead
+
+    def __init__(self, device: Device, real: Real, kappa: wp.array, friction: wp.array, free: wp.array, slip_threshold: float):
+        super().__init__(device, real, kappa, friction, free, slip_threshold)
+        self.diagonal = wp.zeros(len(kappa), dtype=real.mat33, device=device.warp)
+
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:
         """Forces at the iterate x~ added to rhs, and their Hessian and block diagonal there. Recordable.
 
@@ -618,10 +640,6 @@ class ActivePairs:
         pushed, rubbed = (weights[:, :, None] * each[:, None, :] for each in (along[:, None] * normals, across))
         return Exerted(quads, pushed), Exerted(quads, rubbed)
 
-    def listed(self, *arrays: wp.array) -> list[np.ndarray]:
-        """The entries in use of arrays with one a pair, numbers as float64."""
-        return listed(int(self.count.numpy()[0]), *arrays)
-
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
         inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
@@ -633,15 +651,6 @@ class ActivePairs:
         inputs = [self.count, p, self.quads, self.weights, self.normals, self.friction, self.hessian, self.response]
         self.device.launch_list(k.stretch, self.capacity, inputs)
         self.device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
-
-    def energy(self, out: wp.array, slot: int) -> None:
-        """out[slot] = sum of kappa m b(d0) over the pairs, in joules. Recordable."""
-        self.device.launch(
-            self.kernels.pair_energy,
-            self.capacity,
-            [self.count, self.gaps, self.activation, self.stiffness, self.energies],
-        )
-        self.energy_sum.sum(self.energies, out, slot)
 
 
 def listed(count: int, *arrays: wp.array) -> list[np.ndarray]:

@@ -25,7 +25,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import ActivePairs
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real
 
@@ -39,15 +41,15 @@ def kernels(real: Real) -> SimpleNamespace:
     mat43 = wp.types.matrix((4, 3), scalar)
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, needed_out: wp.array(dtype=wp.int32)):
         needed_out[0] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def forget(first: int, rebound_out: wp.array(dtype=scalar)):
         rebound_out[first + wp.tid()] = scalar(0.0)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def aim(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -99,7 +101,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     needed_out[0] = 1  # whoever writes, writes the same
                 pull_out[k] = pull
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def inertia(
         first: int,
         x_now: wp.array(dtype=vec3),
@@ -115,7 +117,7 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[i] = -free[i] * mass[i] / (h * h) * (x_now[i] - x[i]) - elastic[i]
         increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def linearize(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -140,7 +142,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 hessian_out[k] = pull[k]
                 force_out[k] = pull[k] * (target[k] - wp.dot(normals[k], moved)) * normals[k]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def linearize_exact(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -172,7 +174,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 lever_out[k] = lever
                 hessian_out[k] = pull[k]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def move(
         first: int,
         x: wp.array(dtype=vec3),
@@ -183,7 +185,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         x_now_out[i] = x[i] + free[i] * p[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def kinetic(
         first: int,
         x_start: wp.array(dtype=vec3),
@@ -206,7 +208,7 @@ def kernels(real: Real) -> SimpleNamespace:
         given = scalar(0.5) * wp.dot(v_start[i], v_start[i]) + h * wp.dot(acceleration[i], v)
         excess_out[i] = mass[i] * (scalar(0.5) * wp.dot(v, v) - given)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def limit(first: int, sums: wp.array(dtype=scalar), part_out: wp.array(dtype=scalar)):
         """The largest s <= 1 with s^2 square + s cross + excess <= 0."""
         square = sums[SQUARE]
@@ -220,7 +222,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 part = wp.clamp((wp.sqrt(root) - cross) / (scalar(2.0) * square), scalar(0.0), scalar(1.0))
         part_out[0] = part
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def keep(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -243,7 +245,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
                 rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(normals[k], moved))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):
         i = first + wp.tid()
         x_now[i] = x[i] + part[0] * (x_now[i] - x[i])
@@ -320,6 +322,7 @@ class Restitution:
     def linearize_exact(self, x_start: wp.array) -> None:
         """The pairs' forces and Hessian in the form of `BarrierTerm`, in place of the barrier's."""
         p, k = self.pairs, self.kernels
+        assert isinstance(p, BarrierTerm)
         pairs = [p.count, p.quads, p.weights, p.normals]
         result = [p.energy_of_pair, p.slope, p.lever, p.hessian]
         self.device.launch_list(k.linearize_exact, p.capacity, [*pairs, x_start, self.u_now, p.gaps, p.stiffness, *result])

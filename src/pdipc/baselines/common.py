@@ -1,15 +1,15 @@
 """What both baselines use: sparse symmetric systems in 3 x 3 blocks, their factorisation, and small meshes."""
 
+import importlib
+import importlib.util
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sp
 
 
 def _solver_name() -> str:
-    try:
-        import pypardiso  # noqa: F401
-    except ImportError:
-        return "CHOLMOD (cholespy)"
-    return "MKL PARDISO (pypardiso)"
+    return "CHOLMOD (cholespy)" if importlib.util.find_spec("pypardiso") is None else "MKL PARDISO (pypardiso)"
 
 
 class Cholesky:
@@ -19,12 +19,11 @@ class Cholesky:
     """
 
     name = _solver_name()
+    _solver: Any  # neither library says its types
 
     def __init__(self):
         if self.name.startswith("MKL"):
-            from pypardiso import PyPardisoSolver
-
-            self._solver = PyPardisoSolver(mtype=2)
+            self._solver = importlib.import_module("pypardiso").PyPardisoSolver(mtype=2)
 
     def factorize(self, upper: sp.csr_matrix) -> "Cholesky":
         """Factorises anew."""
@@ -35,10 +34,10 @@ class Cholesky:
             self._solver._call_pardiso(upper, np.zeros((upper.shape[0], 1)))
             self._solver.set_phase(33)
         else:
-            from cholespy import CholeskySolverD, MatrixType
-
-            full = (upper + sp.triu(upper, 1).T).tocsc()
-            self._solver = CholeskySolverD(full.shape[0], full.indptr, full.indices, full.data, MatrixType.CSC)
+            cholespy: Any = importlib.import_module("cholespy")
+            full = sp.csc_matrix(upper + sp.triu(upper, 1).T)
+            kind = cholespy.MatrixType.CSC
+            self._solver = cholespy.CholeskySolverD(full.shape[0], full.indptr, full.indices, full.data, kind)
         return self
 
     def solve(self, b: np.ndarray) -> np.ndarray:
@@ -84,7 +83,7 @@ class BlockPattern:
             parts.append(blocks[pick])
         data = (self._sum @ np.concatenate(parts)).reshape(-1, 3, 3)
         matrix = sp.bsr_matrix((data, self.indices, self.indptr), shape=(3 * self.size, 3 * self.size))
-        return sp.triu(matrix.tocsr(), format="csr")
+        return sp.csr_matrix(sp.triu(matrix.tocsr(), format="csr"))
 
 
 def scatter(stencil: np.ndarray, values: np.ndarray, vertex_count: int) -> np.ndarray:
@@ -141,7 +140,7 @@ def sphere(radius, level=3, centre=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndar
         x /= np.linalg.norm(x, axis=1)[:, None]
         a, b, c = t.T
         t = np.concatenate(
-            [np.stack(q, axis=1) for q in ((a, m[:, 0], m[:, 2]), (m[:, 0], b, m[:, 1]), (m[:, 2], m[:, 1], c), m.T)]
+            [np.stack(q, axis=1) for q in ((a, m[:, 0], m[:, 2]), (m[:, 0], b, m[:, 1]), (m[:, 2], m[:, 1], c), tuple(m.T))]
         )
     return radius * x + centre, t
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .common import BlockPattern, Cholesky, scatter
-from .contact import DistanceBarrier, SquaredDistanceBarrier
+from .contact import DistanceBarrier, Friction, SquaredDistanceBarrier
 from .energies import Term
 
 ROUNDING = 1e-12  # rise of the energy that a search takes for rounding, of the energy and that of the predicted motion;
@@ -23,7 +23,7 @@ LAG_ITERATIONS = 30  # iterations that may move kinematic vertices towards their
 
 @dataclass
 class Problem:
-    """What stays constant. masses: (n,) kg. kinematic: (n,) bool, vertices that follow targets. terms: elastic energies.
+    """What stays constant. masses: (n,) kg. kinematic: (n,) bool, vertices that follow targets; absent: none. terms: elastic energies.
 
     time_step: h, s. gravity: (3,) m/s^2. damping: 1/s, as a force -damping m v. contact: None for none.
     """
@@ -31,14 +31,14 @@ class Problem:
     masses: np.ndarray
     terms: list[Term]
     time_step: float
-    kinematic: np.ndarray | None = None
+    kinematic: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     contact: DistanceBarrier | SquaredDistanceBarrier | None = None
     gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
     damping: float = 0.0
 
     def __post_init__(self):
         n = len(self.masses)
-        if self.kinematic is None:
+        if not len(self.kinematic):
             self.kinematic = np.zeros(n, dtype=bool)
         self.free = np.flatnonzero(~self.kinematic)
         if (self.masses[self.free] <= 0).any():
@@ -87,7 +87,7 @@ class _Step:
     def __init__(self, problem: Problem, state: State, acceleration: np.ndarray, tolerance: float):
         h, self.problem, self.start = problem.time_step, problem, state.positions
         self.z = state.positions + h * state.velocities + h * h * acceleration
-        self.friction = None
+        self.friction: Friction | None = None
         self._elastic: tuple[np.ndarray | None, float] = (None, 0.0)  # the last positions asked for, and their elastic energy
         free = problem.free
         motion = (self.z - self.start)[free]
@@ -177,7 +177,7 @@ def step(
         problem.contact.ready(x)
     lagged = 0
     for _ in range(friction_iterations):
-        before = info.iterations
+        before, settled = info.iterations, False
         if problem.contact:
             objective.friction = problem.contact.friction_at(x, state.positions)
         for _ in range(max_iterations):

@@ -19,7 +19,7 @@ CHUNK = 4_000_000  # point-triangle pairs treated at once
 
 @dataclass
 class Problem:
-    """What stays constant. masses: (n,) kg. terms: elastic energies. time_step: h, s. kinematic: (n,) bool.
+    """What stays constant. masses: (n,) kg. terms: elastic energies. time_step: h, s. kinematic: (n,) bool; absent: none.
 
     surfaces: closed surfaces, each (m, 3) triangles, outward; a vertex that lies inside one of them and is no part of it is
     pushed out. planes: (point, normal) pairs that vertices stay above. collision_weight: N/m of such a vertex; by default 100
@@ -29,7 +29,7 @@ class Problem:
     masses: np.ndarray
     terms: list[Term]
     time_step: float
-    kinematic: np.ndarray | None = None
+    kinematic: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     surfaces: list[np.ndarray] = field(default_factory=list)
     planes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
@@ -37,7 +37,7 @@ class Problem:
 
     def __post_init__(self):
         n = len(self.masses)
-        if self.kinematic is None:
+        if not len(self.kinematic):
             self.kinematic = np.zeros(n, dtype=bool)
         self.free, self.held = np.flatnonzero(~self.kinematic), np.flatnonzero(self.kinematic)
         if self.collision_weight is None:
@@ -48,7 +48,7 @@ class Problem:
             g, weight = term.rows(n)
             weighted = sp.diags(weight) @ g
             matrix = matrix + g.T @ weighted
-            self._rows.append(weighted.T.tocsr())
+            self._rows.append(sp.csr_matrix(weighted.T))
         self._coupling = matrix[self.free][:, self.held]
         self._matrix = sp.triu(matrix[self.free][:, self.free], format="csr")
         self._cholesky, self._colliding = Cholesky(), None
@@ -96,6 +96,7 @@ def step(
     z = state.positions + h * state.velocities + h * h * total
     z[held] = (state.positions if targets is None else targets)[held]
     x = z.copy()
+    colliding = np.zeros(len(x), dtype=bool)
     for _ in range(iterations):
         colliding, nearest = detect(problem, x)
         x[free] = problem.solve(problem.right_hand_side(x, z), x[held], colliding, nearest)

@@ -3,6 +3,8 @@
 Only data cross over. What is made of them, energies, their derivatives, contact and the solver, is this package's own.
 """
 
+from typing import Any
+
 import numpy as np
 
 from . import contact, energies, ipc
@@ -60,7 +62,7 @@ class Reference:
         acceleration = model.external.accelerations(self.time, self.state.positions, self.state.velocities)
         self.time += self.problem.time_step
         soft = [pin for pin in a.pins if pin.stiffness is not None and len(pin.vertices)]
-        held = [
+        held: list[Any] = [  # of points, which have `values`
             t.manifold for s, t in zip(model.projector.sets, self.problem.terms, strict=True) if s.kind == "point_attachment"
         ]
         for pin, manifold in zip(soft, held, strict=True):

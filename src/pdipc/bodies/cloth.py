@@ -27,6 +27,7 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
     """The constraints of a cloth, and the masses (n,) kg of its vertices among all."""
     x, m = assembly.rest_positions, body.material
     assert isinstance(m, ClothMaterial)
+    assert m.membrane_stiffness is not None  # its validator has set it
     shape = body.elastic_shape
     rest, corners = (x, body.triangles) if shape is None else shape
     sets = []

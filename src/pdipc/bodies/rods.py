@@ -24,6 +24,7 @@ def elasticity(x: np.ndarray, body: AssembledBody, m: RodMaterial) -> tuple[list
     chain = np.column_stack([segments[joints[:, 0]], segments[joints[:, 1], 1]])
     mass = np.zeros(len(x))
     if len(ghosts):
+        assert m.bending_stiffness is not None and m.twist_stiffness is not None  # their validator has set them
         away = np.linalg.norm(x[ghosts] - x[segments].mean(axis=1), axis=1)
         part = np.minimum(0.5 * m.radius**2 / away**2, GHOST_MASS)
         mass[ghosts] = part * weight

@@ -17,6 +17,7 @@ from pdipc.collision import moving_boxes as sweep
 from pdipc.collision import sieve
 from pdipc.collision.moving_boxes import Box, Boxes, join, load, meet
 from pdipc.collision.surface import Surface
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -27,15 +28,15 @@ def kernels(real: Real) -> SimpleNamespace:
     passes = sieve.functions(real)
     Sieve = passes.Sieve
 
-    @wp.func
+    @func
     def of_edge(boxes: Boxes, e: wp.vec2i) -> Box:
         return join(load(boxes, e[0]), load(boxes, e[1]))
 
-    @wp.func
+    @func
     def of_triangle(boxes: Boxes, t: wp.vec3i) -> Box:
         return join(join(load(boxes, t[0]), load(boxes, t[1])), load(boxes, t[2]))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweep_triangles(
         first: int,
         triangles: wp.array(dtype=wp.vec3i),
@@ -48,7 +49,7 @@ def kernels(real: Real) -> SimpleNamespace:
         low_out[i] = wp.min(box.begin_low, box.end_low)
         high_out[i] = wp.max(box.begin_high, box.end_high)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweep_edges(
         first: int,
         edges: wp.array(dtype=wp.vec2i),
@@ -61,7 +62,7 @@ def kernels(real: Real) -> SimpleNamespace:
         low_out[i] = wp.min(box.begin_low, box.end_low)
         high_out[i] = wp.max(box.begin_high, box.end_high)
 
-    @wp.func
+    @func
     def insert(begin: int, held: int, pair: wp.vec2i, out: wp.array(dtype=wp.vec2i)):
         """Keeps a primitive's finds in ascending order, whatever the order of the tree."""
         p = int(held)
@@ -70,7 +71,7 @@ def kernels(real: Real) -> SimpleNamespace:
             p -= 1
         out[begin + p] = pair
 
-    @wp.func
+    @func
     def search_triangles(
         i: int,
         tree: wp.uint64,
@@ -99,7 +100,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     found += 1
         return found
 
-    @wp.func
+    @func
     def search_edges(
         i: int,
         tree: wp.uint64,
@@ -129,7 +130,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         found += 1
         return found
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_triangles(
         first: int,
         tree: wp.uint64,
@@ -145,7 +146,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         found_out[i] = search_triangles(i, tree, vertices, triangles, obstacle, boxes, sieve, i * room, room, slots_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_edges(
         first: int,
         tree: wp.uint64,
@@ -160,7 +161,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         found_out[i] = search_edges(i, tree, edges, obstacle, boxes, sieve, i * room, room, slots_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def pack_triangles(
         first: int,
         tree: wp.uint64,
@@ -187,7 +188,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 for k in range(found[i]):
                     pairs_out[begin + k] = slots[i * room + k]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def pack_edges(
         first: int,
         tree: wp.uint64,

@@ -28,6 +28,7 @@ import warp as wp
 from pdipc.collision import distance, sieve
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device, Largest, Span
 from pdipc.device.precision import Real
 
@@ -48,7 +49,7 @@ def kernels(real: Real) -> SimpleNamespace:
     nothing = wp.constant(scalar(IGNORED))
     silent = wp.constant(SILENT)
 
-    @wp.func
+    @func
     def limits(
         a: int,
         b: int,
@@ -75,7 +76,7 @@ def kernels(real: Real) -> SimpleNamespace:
             reach = wp.min(reach, scalar(REST_FRACTION) * rest_distance - xi)
         return vec2(xi, reach)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def vertex_triangle_limits(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -111,7 +112,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     rest_distance = scalar(distance.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]]))
                 limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def edge_edge_limits(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -145,12 +146,12 @@ def kernels(real: Real) -> SimpleNamespace:
                     rest_distance = scalar(distance.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]]))
                 limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
 
-    @wp.func
+    @func
     def near(x: vec3, y: vec3, margin: scalar) -> bool:
         """A comparison with NaN is false: what is not known to be near is away."""
         return wp.length(distance.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def depart(
         first: int,
         x0: wp.array(dtype=vec3),
@@ -172,7 +173,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if not near(x1[i], end[i], margin):
             away[3] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def decide(
         first: int,
         away: wp.array(dtype=wp.int32),
@@ -189,7 +190,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(4):
             away[i] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def keep(
         first: int,
         x0: wp.array(dtype=vec3),

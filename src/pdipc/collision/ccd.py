@@ -45,6 +45,7 @@ import warp as wp
 
 from pdipc.collision import cubic as cubics
 from pdipc.collision.distance import relative
+from pdipc.device.language import func
 from pdipc.device.precision import Real, Scalar, Vec3, unit_roundoff
 
 MAX_ITERATIONS = 64
@@ -61,13 +62,13 @@ DIRECTIONS = 3  # choices of n that are tried before giving up
 # Directions between closest points; `choice` 0 is the best guess, 1 and 2 are tried when that one does not separate.
 
 
-@wp.func
+@func
 def across(r: Vec3, e: Vec3):
     """r made orthogonal to e once more: cancellation in r left a part along e, which is long where r is short."""
     return r - (wp.dot(r, e) / wp.dot(e, e)) * e
 
 
-@wp.func
+@func
 def segment_direction(a: Vec3, b: Vec3):
     """From the origin to the nearest point of a segment."""
     e = b - a
@@ -80,21 +81,21 @@ def segment_direction(a: Vec3, b: Vec3):
     return across(a + (along / length_sq) * e, e)
 
 
-@wp.func
+@func
 def shorter(a: Vec3, b: Vec3):
     if wp.dot(b, b) < wp.dot(a, a):
         return b
     return a
 
 
-@wp.func
+@func
 def facing(n: Vec3, q: Vec3):
     if wp.dot(n, q) < type(n[0])(0.0):
         return -n
     return n
 
 
-@wp.func
+@func
 def vertex_triangle_direction(a: Vec3, b: Vec3, c: Vec3, choice: int):
     """From a vertex at the origin to the nearest point of a triangle; not normalized."""
     zero = type(a[0])(0.0)
@@ -116,7 +117,7 @@ def vertex_triangle_direction(a: Vec3, b: Vec3, c: Vec3, choice: int):
     return shorter(shorter(segment_direction(a, b), segment_direction(b, c)), segment_direction(c, a))
 
 
-@wp.func
+@func
 def edge_edge_direction(q00: Vec3, q01: Vec3, q10: Vec3, q11: Vec3, choice: int):
     """From the nearest point of edge a to that of edge b, q_ij = b_j - a_i; not normalized."""
     zero = type(q00[0])(0.0)
@@ -161,33 +162,33 @@ def edge_edge_direction(q00: Vec3, q01: Vec3, q10: Vec3, q11: Vec3, choice: int)
 
 
 # Outside of these a square could under- or overflow.
-@wp.func
+@func
 def small_square(like: wp.float64):
     return wp.float64(1.0e-250)
 
 
-@wp.func
+@func
 def small_square(like: wp.float32):  # noqa: F811
     return wp.float32(1.0e-30)
 
 
-@wp.func
+@func
 def large_number(like: wp.float64):
     return wp.float64(1.0e45)
 
 
-@wp.func
+@func
 def large_number(like: wp.float32):  # noqa: F811
     return wp.float32(1.0e6)
 
 
-@wp.func
+@func
 def keeps_on_axis(m0: Scalar, m1: Scalar, near: Scalar, far: Scalar, kept: Scalar) -> bool:
     m = wp.min(m0, m1)
     return m > far or m - kept * m0 > near
 
 
-@wp.func
+@func
 def boxes_keep(above0: Vec3, above1: Vec3, below0: Vec3, below1: Vec3, xi: Scalar, backoff: Scalar, reach: Scalar) -> bool:
     """Gaps of boxes along the axes in both orders, at the start and the end."""
     u = type(xi)(REJECT_SLACK) * unit_roundoff(xi)
@@ -204,7 +205,7 @@ def boxes_keep(above0: Vec3, above1: Vec3, below0: Vec3, below1: Vec3, xi: Scala
     )
 
 
-@wp.func
+@func
 def plane_keeps(n: Vec3, m0: Scalar, m1: Scalar, size: Scalar, xi: Scalar, backoff: Scalar, reach: Scalar) -> bool:
     """Projections on n, at least m0 at the start and m1 at the end, each off by the slack."""
     zero = type(xi)(0.0)
@@ -225,7 +226,7 @@ def plane_keeps(n: Vec3, m0: Scalar, m1: Scalar, size: Scalar, xi: Scalar, backo
 
 
 # Arguments: a pair's eight points, and what it is to keep.
-@wp.func
+@func
 def vertex_triangle_keep(
     p0: Vec3, a0: Vec3, b0: Vec3, c0: Vec3, p1: Vec3, a1: Vec3, b1: Vec3, c1: Vec3,
     xi: Scalar, backoff: Scalar, reach: Scalar,
@@ -248,7 +249,7 @@ def vertex_triangle_keep(
 
 
 # Arguments: a pair's eight points, and what it is to keep.
-@wp.func
+@func
 def edge_edge_keep(
     a00: Vec3, a10: Vec3, b00: Vec3, b10: Vec3, a01: Vec3, a11: Vec3, b01: Vec3, b11: Vec3,
     xi: Scalar, backoff: Scalar, reach: Scalar,
@@ -287,7 +288,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     shortest_sq = wp.constant(wide(1.0e-280))  # below, a square does
     least_size, most_size = wp.constant(wide(SMALLEST)), wp.constant(wide(LARGEST))
 
-    @wp.func
+    @func
     def narrow(t: wide) -> scalar:
         """A time in the scene's precision, rounded down."""
         if t < smallest:
@@ -297,7 +298,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     def advance(edge_edge: bool):
         # Arguments: the same, less the vertex that they are relative to.
         # Long: one loop, whose parts share all of its state.
-        @wp.func
+        @func
         def time_kept(
             p0: wide3, p1: wide3, p2: wide3, p3: wide3, r0: wide3, r1: wide3, r2: wide3, r3: wide3,
             xi: wide, backoff: wide, reach: wide,
@@ -411,7 +412,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
     advance_edge_edge = advance(True)
 
     # Arguments: a pair's eight points, and what it is to keep.
-    @wp.func
+    @func
     def vertex_triangle(
         p0: vec3, a0: vec3, b0: vec3, c0: vec3, p1: vec3, a1: vec3, b1: vec3, c1: vec3,
         xi: scalar, backoff: scalar, reach: scalar,
@@ -434,7 +435,7 @@ def variant(real: Real, rejects: bool = True, cubic: str = "head start", steps: 
         )  # fmt: skip
 
     # Arguments: the same.
-    @wp.func
+    @func
     def edge_edge(
         a00: vec3, a10: vec3, b00: vec3, b10: vec3, a01: vec3, a11: vec3, b01: vec3, b11: vec3,
         xi: scalar, backoff: scalar, reach: scalar,

@@ -30,6 +30,8 @@ is taken off. Underflow is far below the rounding of the smallest d(0) that is u
 
 import warp as wp
 
+from pdipc.device.language import func
+
 wide = wp.float64
 
 EVALUATION = 32.0 * 2.0**-53
@@ -39,7 +41,7 @@ MAX_ITERATIONS = 16
 NEVER = 2.0
 
 
-@wp.func
+@func
 def coefficients(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d, w1: wp.vec3d):
     """(A, B, C, D) of the volume (u x v) . w as u, v, w move linearly from 0 to 1."""
     du = u1 - u0
@@ -56,7 +58,7 @@ def coefficients(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1: wp.
     )
 
 
-@wp.func
+@func
 def coefficient_error(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d, w1: wp.vec3d, size: wide):
     """How far d(t) with the computed coefficients may be from the true one on [0, 1]; size: the Q of the lemma."""
     off = wide(COEFFICIENTS) * size
@@ -66,24 +68,24 @@ def coefficient_error(u0: wp.vec3d, v0: wp.vec3d, w0: wp.vec3d, u1: wp.vec3d, v1
     return off * (big_u * big_v + (big_u + big_v) * big_w)
 
 
-@wp.func
+@func
 def largest_area(u0: wp.vec3d, v0: wp.vec3d, u1: wp.vec3d, v1: wp.vec3d):
     """A bound of |u(t) x v(t)| on [0, 1]: the largest control point of this quadratic curve."""
     middle = wide(0.5) * (wp.cross(u0, v1) + wp.cross(u1, v0))
     return wp.max(wp.max(wp.length(wp.cross(u0, v0)), wp.length(wp.cross(u1, v1))), wp.length(middle))
 
 
-@wp.func
+@func
 def value(k: wp.vec4d, t: wide):
     return ((k[0] * t + k[1]) * t + k[2]) * t + k[3]
 
 
-@wp.func
+@func
 def slope(k: wp.vec4d, t: wide):
     return (wide(3.0) * k[0] * t + wide(2.0) * k[1]) * t + k[2]
 
 
-@wp.func
+@func
 def first_root(k: wp.vec4d, margin: wide, tolerance: wide):
     """Time up to which |A t^3 + B t^2 + C t + D| stays above `margin`, from below, or 2 where it does on all of [0, 1].
 

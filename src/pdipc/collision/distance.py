@@ -12,6 +12,7 @@ Nothing here is needed for safety: `ccd` proves its times, and `sieve` what it l
 
 import warp as wp
 
+from pdipc.device.language import func
 from pdipc.device.precision import Vec3
 
 OVERESTIMATE = 1.0e-12
@@ -20,13 +21,13 @@ wide, wide3, wide4 = wp.float64, wp.vec3d, wp.vec4d
 WELL_SHAPED = 1.0e-8  # squared sine between edges above which the plain formulas of the closest points inside do
 
 
-@wp.func
+@func
 def relative(x: Vec3, origin: Vec3) -> wide3:
     """x - origin in double precision."""
     return wide3(wide(x[0]) - wide(origin[0]), wide(x[1]) - wide(origin[1]), wide(x[2]) - wide(origin[2]))
 
 
-@wp.func
+@func
 def along_segment(a: wide3, b: wide3) -> wide:
     """The parameter in [0, 1] of the point of segment a-b that is nearest to the origin; 0 for a segment of no length."""
     e = b - a
@@ -36,7 +37,7 @@ def along_segment(a: wide3, b: wide3) -> wide:
     return wide(0.0)
 
 
-@wp.func
+@func
 def slide(w: wide4, a: wide3, b: wide3, c: wide3, i: int, j: int) -> wide4:
     """The point of weights w moved parallel to the edge of the corners i and j to where it is nearest to the origin."""
     e = a - b
@@ -53,7 +54,7 @@ def slide(w: wide4, a: wide3, b: wide3, c: wide3, i: int, j: int) -> wide4:
     return w
 
 
-@wp.func
+@func
 def triangle_weights(a: wide3, b: wide3, c: wide3) -> wide4:
     """(1, -b0, -b1, -b2): the point of a triangle that is nearest to the origin, in barycentric coordinates."""
     ab = b - a
@@ -91,7 +92,7 @@ def triangle_weights(a: wide3, b: wide3, c: wide3) -> wide4:
     return best
 
 
-@wp.func
+@func
 def segment_weights(a1: wide3, b0: wide3, b1: wide3) -> wide4:
     """(1 - s, s, t - 1, -t): the nearest points of the edges 0-a1 and b0-b1."""
     one = wide(1.0)
@@ -146,39 +147,39 @@ def segment_weights(a1: wide3, b0: wide3, b1: wide3) -> wide4:
     return best
 
 
-@wp.func
+@func
 def vertex_triangle_weights(p: Vec3, a: Vec3, b: Vec3, c: Vec3) -> wide4:
     """Weights w = (1, -b0, -b1, -b2) of the closest points: r = sum w_i x_i points from the triangle to the vertex."""
     return triangle_weights(relative(a, p), relative(b, p), relative(c, p))
 
 
-@wp.func
+@func
 def edge_edge_weights(a0: Vec3, a1: Vec3, b0: Vec3, b1: Vec3) -> wide4:
     """Weights w = (1 - s, s, -(1 - t), -t) of the closest points: r = sum w_i x_i points from edge b to edge a."""
     return segment_weights(relative(a1, a0), relative(b0, a0), relative(b1, a0))
 
 
-@wp.func
+@func
 def origin_triangle_distance(a: wide3, b: wide3, c: wide3) -> wide:
     """Distance of the origin and a triangle."""
     w = triangle_weights(a, b, c)
     return wp.length(w[1] * a + w[2] * b + w[3] * c)
 
 
-@wp.func
+@func
 def origin_segment_distance(a1: wide3, b0: wide3, b1: wide3) -> wide:
     """Distance of the edges 0-a1 and b0-b1."""
     w = segment_weights(a1, b0, b1)
     return wp.length(w[1] * a1 + w[2] * b0 + w[3] * b1)
 
 
-@wp.func
+@func
 def vertex_triangle_distance(p: Vec3, a: Vec3, b: Vec3, c: Vec3) -> wide:
     """Distance of a vertex and a triangle, in metres."""
     return origin_triangle_distance(relative(a, p), relative(b, p), relative(c, p))
 
 
-@wp.func
+@func
 def edge_edge_distance(a0: Vec3, a1: Vec3, b0: Vec3, b1: Vec3) -> wide:
     """Distance of two edges, in metres."""
     return origin_segment_distance(relative(a1, a0), relative(b0, a0), relative(b1, a0))

@@ -30,7 +30,7 @@ def flat_faces(x: np.ndarray, triangles: np.ndarray, keeps_shape: np.ndarray, to
     neighbours = _flat_neighbours(x, triangles, keeps_shape, tolerance)
     if not len(neighbours):
         return face
-    graph = scipy.sparse.coo_matrix((np.ones(len(neighbours)), neighbours.T), shape=(len(triangles),) * 2)
+    graph = scipy.sparse.coo_matrix((np.ones(len(neighbours)), neighbours.T), shape=(len(triangles), len(triangles)))
     region = connected_components(graph, directed=False)[1]
     order, pairs = np.argsort(region, kind="stable"), neighbours[np.argsort(region[neighbours[:, 0]], kind="stable")]
     ends, pair_ends = (np.searchsorted(of, np.unique(region), "right") for of in (region[order], region[pairs[:, 0]]))
@@ -115,8 +115,8 @@ def _convex_parts(
     joined = True
     while joined:
         joined = False
-        for one, other in place[neighbours]:
-            a, b = label[one], label[other]
+        for one, other in place[neighbours].tolist():
+            a, b = int(label[one]), int(label[other])
             if a != b and (found := hull(np.concatenate([outline[a], outline[b]]), area[a] + area[b])) is not None:
                 label[label == b] = a
                 outline[a], area[a] = found, area[a] + area[b]

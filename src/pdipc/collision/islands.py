@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.collision.candidates import Candidates
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
@@ -22,11 +23,11 @@ def kernels(real: Real):
     zero = wp.constant(real.scalar(0.0))
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, near_out: wp.array(dtype=wp.int32)):
         near_out[first + wp.tid()] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def connect(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -44,7 +45,7 @@ def kernels(real: Real):
                 if a != b and a >= 0 and b >= 0:
                     near_out[wp.max(a, b) * bodies + wp.min(a, b)] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def label(
         first: int,
         bodies: int,
@@ -74,7 +75,7 @@ def kernels(real: Real):
             if changed == 0:
                 break
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def mark_driven(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -97,7 +98,7 @@ def kernels(real: Real):
                 if b < 0 and a >= 0 and wp.length_sq(u_tilde[q] - u[q]) > zero:
                     driven_out[a] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def mark_pinned(
         first: int,
         pinned: wp.array(dtype=wp.vec2i),

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import Kernel, func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -28,20 +29,20 @@ LARGEST_LIST = 2**31 - 1
 FARTHEST = 1.0e18  # m
 
 
-@wp.struct
+@struct
 class Boxes:
     """Boxes of things that move in straight lines, where the motion begins and where it ends; float32.
 
     At a fraction s of the way a thing is inside the box (1 - s) begin + s end.
     """
 
-    begin_low: wp.array(dtype=wp.vec3)
-    begin_high: wp.array(dtype=wp.vec3)
-    end_low: wp.array(dtype=wp.vec3)
-    end_high: wp.array(dtype=wp.vec3)
+    begin_low: wp.array[wp.vec3]
+    begin_high: wp.array[wp.vec3]
+    end_low: wp.array[wp.vec3]
+    end_high: wp.array[wp.vec3]
 
 
-@wp.struct
+@struct
 class Box:
     """One of `Boxes`."""
 
@@ -51,7 +52,7 @@ class Box:
     end_high: wp.vec3
 
 
-@wp.func
+@func
 def load(boxes: Boxes, i: int) -> Box:
     box = Box()
     box.begin_low = boxes.begin_low[i]
@@ -61,7 +62,7 @@ def load(boxes: Boxes, i: int) -> Box:
     return box
 
 
-@wp.func
+@func
 def store(boxes: Boxes, i: int, box: Box):
     boxes.begin_low[i] = box.begin_low
     boxes.begin_high[i] = box.begin_high
@@ -69,7 +70,7 @@ def store(boxes: Boxes, i: int, box: Box):
     boxes.end_high[i] = box.end_high
 
 
-@wp.func
+@func
 def join(a: Box, b: Box) -> Box:
     """The box around two."""
     box = Box()
@@ -80,7 +81,7 @@ def join(a: Box, b: Box) -> Box:
     return box
 
 
-@wp.func
+@func
 def meet(a: Box, b: Box) -> bool:
     """Whether they may overlap at some fraction of their ways: not where one begins, and ends, on the same side of the other (Lemma 1)."""
     for axis in range(3):
@@ -106,7 +107,7 @@ def kernels(real: Real) -> SimpleNamespace:
     wide = wp.float64
     farthest = wp.constant(wide(FARTHEST))
 
-    @wp.func
+    @func
     def corner(x: vec3, reach: wide) -> wp.vec3:
         """x + reach, by the maps of Lemma 2."""
         v = wp.vec3d(wide(x[0]) + reach, wide(x[1]) + reach, wide(x[2]) + reach)
@@ -116,7 +117,7 @@ def kernels(real: Real) -> SimpleNamespace:
             wp.float32(wp.clamp(v[2], -farthest, farthest)),
         )
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def vertex_boxes(
         first: int,
         x0: wp.array(dtype=vec3),
@@ -131,7 +132,7 @@ def kernels(real: Real) -> SimpleNamespace:
         boxes_out.end_low[i] = corner(x1[i], -r)
         boxes_out.end_high[i] = corner(x1[i], r)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def settle(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -169,7 +170,7 @@ class PairList:
         self.room, self.slots = each, None  # the old ones are given back first
         self.slots = wp.zeros(max(1, self.primitives * each), dtype=wp.vec2i, device=self.device.warp)
 
-    def fill(self, find: wp.Kernel, pack: wp.Kernel, inputs: list) -> None:
+    def fill(self, find: Kernel, pack: Kernel, inputs: list) -> None:
         """Launches the search `find(first, *inputs, room, slots, found)`, which counts all and keeps what fits the slots, and
         `pack`, which searches again where the slots did not hold all."""
         device, common = self.device, [*inputs, self.room, self.slots, self.found]

@@ -21,6 +21,8 @@ from pdipc.collision import moving_boxes as sweep
 from pdipc.collision import sieve
 from pdipc.collision.moving_boxes import Box, Boxes, join, load, meet, store
 from pdipc.collision.surface import MORTON_BITS, Surface
+from pdipc.device import language
+from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -45,11 +47,11 @@ _MEETING = """
 """
 
 
-@wp.func_native(_MEETING)
+@language.func_native(_MEETING)
 def meeting(boxes: wp.array(dtype=wp.float32), block: int, box: Box) -> wp.uint32: ...
 
 
-@wp.func_native("""
+@language.func_native("""
 #if defined(__CUDA_ARCH__)
     return __ffs(mask) - 1;
 #else
@@ -59,27 +61,27 @@ def meeting(boxes: wp.array(dtype=wp.float32), block: int, box: Box) -> wp.uint3
 def lowest_bit(mask: wp.uint32) -> int: ...
 
 
-@wp.struct
+@struct
 class Patches:
     """Device arrays of the hierarchy; see `PatchCulling`."""
 
     leaves: int
     capacity: int  # of `neighbours`
     nodes: Boxes
-    neighbours_end: wp.array(dtype=wp.int32)  # of each patch: where its overlapping patches end in `neighbours`
-    neighbours: wp.array(dtype=wp.int32)  # in ascending order
-    obstacle: wp.array(dtype=wp.int32)  # of each patch: 1 where all its primitives are obstacles
+    neighbours_end: wp.array[wp.int32]  # of each patch: where its overlapping patches end in `neighbours`
+    neighbours: wp.array[wp.int32]  # in ascending order
+    obstacle: wp.array[wp.int32]  # of each patch: 1 where all its primitives are obstacles
 
 
-@wp.struct
+@struct
 class Members:
     """The primitives of one kind, by patch."""
 
-    start: wp.array(dtype=wp.int32)  # (patches + 1,) position of a patch's first primitive
-    home: wp.array(dtype=wp.int32)  # patch of each position
-    inside: wp.array(dtype=wp.uint32)  # of each position: its partners in its own patch, as a mask
-    moving: wp.array(dtype=wp.uint32)  # of each patch: mask of the members that are no obstacles
-    boxes: wp.array(dtype=wp.float32)  # (patches, 12, WIDTH): see above
+    start: wp.array[wp.int32]  # (patches + 1,) position of a patch's first primitive
+    home: wp.array[wp.int32]  # patch of each position
+    inside: wp.array[wp.uint32]  # of each position: its partners in its own patch, as a mask
+    moving: wp.array[wp.uint32]  # of each patch: mask of the members that are no obstacles
+    boxes: wp.array[wp.float32]  # (patches, 12, WIDTH): see above
 
 
 @functools.cache
@@ -90,7 +92,7 @@ def kernels(real: Real) -> SimpleNamespace:
     width = wp.constant(WIDTH)
     nowhere = wp.constant(wp.inf)
 
-    @wp.func
+    @func
     def store_in_block(boxes: wp.array(dtype=wp.float32), slot: int, box: Box):
         begin = (slot / width) * 12 * width + slot % width
         for axis in range(3):
@@ -99,11 +101,11 @@ def kernels(real: Real) -> SimpleNamespace:
             boxes[begin + (6 + axis) * width] = box.end_low[axis]
             boxes[begin + (9 + axis) * width] = box.end_high[axis]
 
-    @wp.func
+    @func
     def corner(boxes: wp.array(dtype=wp.float32), begin: int) -> wp.vec3:
         return wp.vec3(boxes[begin], boxes[begin + width], boxes[begin + 2 * width])
 
-    @wp.func
+    @func
     def load_from_block(boxes: wp.array(dtype=wp.float32), p: int, k: int) -> Box:
         begin = p * 12 * width + k
         box = Box()
@@ -113,7 +115,7 @@ def kernels(real: Real) -> SimpleNamespace:
         box.end_high = corner(boxes, begin + 9 * width)
         return box
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def fill_blocks(
         first: int,
         edge_members: Members,
@@ -134,7 +136,7 @@ def kernels(real: Real) -> SimpleNamespace:
             box = join(join(load(of_vertices, t[0]), load(of_vertices, t[1])), load(of_vertices, t[2]))
             store_in_block(triangle_members.boxes, slot, box)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def fit_patches(
         first: int,
         patches: Patches,
@@ -159,20 +161,20 @@ def kernels(real: Real) -> SimpleNamespace:
             box = join(box, load_from_block(triangle_members.boxes, p, k))
         store(patches.nodes, patches.leaves + p, box)
 
-    @wp.func
+    @func
     def refit(patches: Patches, node: int):
         store(patches.nodes, node, join(load(patches.nodes, 2 * node), load(patches.nodes, 2 * node + 1)))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def refit_level(first: int, patches: Patches, begin: int):
         refit(patches, begin + first + wp.tid())
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def refit_top(first: int, patches: Patches, count: int):
         for i in range(1, count):
             refit(patches, count - i)
 
-    @wp.func
+    @func
     def traverse(patches: Patches, p: int, begin: int, fill: bool) -> int:
         """Counts, or lists from `begin` on, the patches that patch p overlaps, itself among them, left to right."""
         box = load(patches.nodes, patches.leaves + p)
@@ -196,12 +198,12 @@ def kernels(real: Real) -> SimpleNamespace:
                     node += 1
         return found
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def count_neighbours(first: int, patches: Patches, found_out: wp.array(dtype=wp.int32)):
         p = first + wp.tid()
         found_out[p] = traverse(patches, p, 0, False)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def list_neighbours(first: int, patches: Patches, found: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
         p = first + wp.tid()
         begin = patches.neighbours_end[p] - found[p]
@@ -211,7 +213,7 @@ def kernels(real: Real) -> SimpleNamespace:
             traverse(patches, p, begin, True)
 
     # Arguments: two sides with their boxes, and where what is found goes.
-    @wp.func
+    @func
     def search_triangles(
         r: int,
         patches: Patches,
@@ -254,7 +256,7 @@ def kernels(real: Real) -> SimpleNamespace:
                             found += 1
         return found
 
-    @wp.func
+    @func
     def search_edges(
         r: int,
         patches: Patches,
@@ -294,7 +296,7 @@ def kernels(real: Real) -> SimpleNamespace:
                             found += 1
         return found
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_triangles(
         first: int,
         patches: Patches,
@@ -313,7 +315,7 @@ def kernels(real: Real) -> SimpleNamespace:
             r, patches, vertex_members, members, vertices, triangles, of_vertices, sieve, r * room, room, slots_out
         )
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_edges(
         first: int,
         patches: Patches,
@@ -327,7 +329,7 @@ def kernels(real: Real) -> SimpleNamespace:
         r = first + wp.tid()
         found_out[r] = search_edges(r, patches, members, edges, sieve, r * room, room, slots_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def pack_triangles(
         first: int,
         patches: Patches,
@@ -357,7 +359,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 for k in range(found[r]):
                     pairs_out[begin + k] = slots[r * room + k]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def pack_edges(
         first: int,
         patches: Patches,
@@ -420,7 +422,7 @@ class PatchCulling:
             m = Members()
             m.start, m.home = upload(self.starts[kind], wp.int32), upload(homes[kind], wp.int32)
             m.inside, m.moving = upload(inside[kind], wp.uint32), upload(moving[kind], wp.uint32)
-            nowhere = np.tile(np.repeat(np.float32([np.inf, -np.inf]), 3 * WIDTH), 2)
+            nowhere = np.tile(np.repeat(np.array([np.inf, -np.inf], dtype=np.float32), 3 * WIDTH), 2)
             m.boxes = upload(np.tile(nowhere, count if kind else 0), wp.float32)
             self.members.append(m)
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.collision import ccd
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
@@ -24,8 +25,8 @@ def kernels(real: Real) -> SimpleNamespace:
     functions = ccd.functions(real)
 
     def batch(time_of):
-        @wp.kernel(module=module)
-        def kernel(
+        @kernel(module)
+        def many(
             first: int,
             points: wp.array(dtype=vec3, ndim=2),
             xi: scalar,
@@ -40,7 +41,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 xi, backoff, reach,
             )  # fmt: skip
 
-        return kernel
+        return many
 
     return SimpleNamespace(vertex_triangle=batch(functions.vertex_triangle), edge_edge=batch(functions.edge_edge))
 

@@ -31,6 +31,7 @@ import warp as wp
 
 from pdipc.collision import ccd
 from pdipc.collision.distance import relative
+from pdipc.device.language import func, struct_of
 from pdipc.device.precision import Real, Scalar
 
 SLACK = 16.0 * 2.0**-53
@@ -42,7 +43,7 @@ SMALLEST, LEAST = 1.0e-100, 1.0e-90  # of |n|^2, and of R in m
 wide, wide3 = wp.float64, wp.vec3d
 
 
-@wp.func
+@func
 def separates(n: wide3, gap: wide, size: wide, a: Scalar, b: Scalar) -> bool:
     """Whether a gap along n, times |n|, is proven to be more than the two reaches a and b; size: the S of the lemma."""
     left = gap - wide(SLACK) * (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2])) * size
@@ -51,17 +52,17 @@ def separates(n: wide3, gap: wide, size: wide, a: Scalar, b: Scalar) -> bool:
     return n_sq > wide(SMALLEST) and left > wide(0.0) and left * left > far * far * n_sq * wide(ENOUGH)
 
 
-@wp.func
+@func
 def extent(a: wide3, b: wide3, c: wide3) -> wide:
     return wp.max(wp.max(wp.max(wp.abs(a), wp.abs(b)), wp.abs(c)))
 
 
-@wp.func
+@func
 def least(n: wide3, a: wide3, b: wide3, c: wide3) -> wide:
     return wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, c))
 
 
-@wp.func
+@func
 def between(n: wide3, a1: wide3, b0: wide3, b1: wide3) -> wide:
     """The gap along n between the edges 0-a1 and b0-b1, times |n|."""
     return wp.min(wp.dot(n, b0), wp.dot(n, b1)) - wp.max(wp.dot(n, a1), wide(0.0))
@@ -71,14 +72,16 @@ def between(n: wide3, a1: wide3, b0: wide3, b1: wide3) -> wide:
 def functions(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.struct
-    class Sieve:
-        everything: int  # 1: pairs of overlapping boxes all pass, and nothing else is read
-        begin: wp.array(dtype=vec3)  # of each vertex, m
-        end: wp.array(dtype=vec3)
-        reach: wp.array(dtype=scalar)  # of each vertex, m; one for all of a body
+    Sieve = struct_of(
+        "Sieve",
+        __name__,
+        everything=int,  # 1: pairs of overlapping boxes all pass, and nothing else is read
+        begin=wp.array(dtype=vec3),  # of each vertex, m
+        end=wp.array(dtype=vec3),
+        reach=wp.array(dtype=scalar),  # of each vertex, m; one for all of a body
+    )
 
-    @wp.func
+    @func
     def vertex_triangle(sieve: Sieve, v: int, t: wp.vec3i) -> bool:
         """Whether vertex v may meet, or act on, triangle t."""
         if sieve.everything == 1:
@@ -101,7 +104,7 @@ def functions(real: Real) -> SimpleNamespace:
         n = ccd.vertex_triangle_direction(m0, m1, m2, 0)
         return not separates(n, wp.min(least(n, b0, b1, b2), least(n, e0, e1, e2)), size, sieve.reach[v], sieve.reach[t[0]])
 
-    @wp.func
+    @func
     def edge_edge(sieve: Sieve, a: wp.vec2i, b: wp.vec2i) -> bool:
         """Whether edges a and b may meet, or act."""
         if sieve.everything == 1:

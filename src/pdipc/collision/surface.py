@@ -98,6 +98,8 @@ def build(
         members,
         codes,
         np.asarray(obstacle, dtype=bool),
-        *(upload(each.astype(np.int32), wp.int32) for each in (face, inner_edge, inner_vertex)),
+        upload(face.astype(np.int32), wp.int32),
+        upload(inner_edge.astype(np.int32), wp.int32),
+        upload(inner_vertex.astype(np.int32), wp.int32),
         bool((face >= 0).any()),
     )

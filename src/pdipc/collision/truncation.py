@@ -27,8 +27,9 @@ import warp as wp
 
 from pdipc.collision import ccd, distance
 from pdipc.collision.candidates import Candidates
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Span
-from pdipc.device.precision import Real, kernel
+from pdipc.device.precision import Real
 
 UNIT = 1 << 30  # times are kept as integers over this unit, rounded down: the least of several is then exact and race-free
 FIRST_BACKOFF = 0.2  # of the gap stays, in the first pass
@@ -108,7 +109,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
         return sweep_pairs
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def reset(
         first: int,
         groups: int,
@@ -123,7 +124,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if i == 0:
             any_hit_out[0] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, values_out: wp.array(dtype=wp.int32)):
         values_out[first + wp.tid()] = 0
 
@@ -172,7 +173,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
         return spread_times
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def together(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -187,7 +188,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(ends[r], ends[r + 1]):
             multiplier[members[k]] = least
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_least(
         first: int, group_of: wp.array(dtype=wp.int32), multiplier: wp.array(dtype=wp.int32), least: wp.array(dtype=wp.int32)
     ):
@@ -196,7 +197,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if group_of[i] >= 0 and multiplier[i] < unit:
             wp.atomic_min(least, group_of[i], multiplier[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread_least(
         first: int, group_of: wp.array(dtype=wp.int32), least: wp.array(dtype=wp.int32), multiplier: wp.array(dtype=wp.int32)
     ):
@@ -204,7 +205,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if group_of[i] >= 0:
             multiplier[i] = wp.min(multiplier[i], least[group_of[i]])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def level(first: int, ends: wp.array(dtype=wp.int32), members: wp.array(dtype=wp.int32), fraction: wp.array(dtype=scalar)):
         """The same for what their neighbours left them."""
         r = first + wp.tid()
@@ -214,7 +215,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(ends[r], ends[r + 1]):
             fraction[members[k]] = least
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def shorten(
         first: int,
         multiplier: wp.array(dtype=wp.int32),
@@ -238,7 +239,7 @@ def kernels(real: Real) -> SimpleNamespace:
             # nobody moves, which is always feasible
             fraction[i] = scalar(0.0)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def grade(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -260,7 +261,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 f = wp.min(f, fraction[j] + scalar(GRADE) * wp.length(x[j] - x[i]) / wp.max(motion, scalar(1.0e-30)))
         fraction_out[i] = f
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def place(
         first: int,
         base: wp.array(dtype=vec3),
@@ -275,7 +276,7 @@ def kernels(real: Real) -> SimpleNamespace:
             u_end_out[i] = u[i] + fraction[i] * (u_tilde[i] - u[i])
             x_end_out[i] = base[i] + u_end_out[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def decide(
         first: int,
         any_hit: wp.array(dtype=wp.int32),
@@ -288,7 +289,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 going_out[0] = 1
             passes[0] = passes[0] + 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin_pass(
         first: int,
         base: wp.array(dtype=vec3),

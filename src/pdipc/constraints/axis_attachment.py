@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -38,7 +39,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     element = wp.types.vector(1, wp.int32)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def force(
         first: int,
         vertices: wp.array(dtype=element),
@@ -55,7 +56,7 @@ def kernels(real: Real) -> SimpleNamespace:
         v = vertices[e][0]
         corners_out[offset + e] = weight[e] * wp.cw_mul(axes[e], (point[e] - base[v]) - u[v])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def energy(
         first: int,
         vertices: wp.array(dtype=element),
@@ -74,7 +75,7 @@ def kernels(real: Real) -> SimpleNamespace:
             d[k] = wp.float64(axes[e][k]) * (wp.float64(point[e][k]) - wp.float64(base[v][k]) - wp.float64(u[v][k]))
         energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.length_sq(d)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def multiply(
         first: int,
         vertices: wp.array(dtype=wp.int32),

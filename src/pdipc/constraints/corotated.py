@@ -12,6 +12,7 @@ import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
 
@@ -35,13 +36,13 @@ def functions(real: Real) -> SimpleNamespace:
     rot = rotation.functions(real)
     cofactor, nearest_rotation = rot.cofactor, rot.nearest_rotation
 
-    @wp.func
+    @func
     def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
         c = cofactor(f)
         j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
         return two * mu * (f - nearest_rotation(f)) + lame * (j - one) * c
 
-    @wp.func
+    @func
     def principal(s: vec3, mu: scalar, lame: scalar):
         c = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
         m = two * mu
@@ -58,7 +59,7 @@ def functions(real: Real) -> SimpleNamespace:
         )
         return stretch, m * turned + pressure * s, vec3(m, m, m) - pressure * s
 
-    @wp.func
+    @func
     def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
         d = f - nearest_rotation(f)
         j = wp.determinant(f) - one

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 SWEEPS = 5  # of the three rotations; four already reach rounding
@@ -17,7 +18,7 @@ def functions(real: Real) -> SimpleNamespace:
     one, zero = wp.constant(scalar(1.0)), wp.constant(scalar(0.0))
     rounding = wp.constant(scalar(real.unit_roundoff))
 
-    @wp.func
+    @func
     def turn(app: scalar, aqq: scalar, apq: scalar):
         """Cosine and sine of the rotation that annihilates apq (Golub and Van Loan, 8.5.2)."""
         c = one
@@ -29,7 +30,7 @@ def functions(real: Real) -> SimpleNamespace:
             s = t * c
         return c, s
 
-    @wp.func
+    @func
     def symmetric(a: mat33):
         """Eigenvalues (vec3) and the matrix whose columns are the eigenvectors, of the symmetric part of a."""
         a00 = a[0, 0]
@@ -83,7 +84,7 @@ def functions(real: Real) -> SimpleNamespace:
             v1 = w
         return vec3(a00, a11, a22), wp.matrix_from_cols(v0, v1, v2)
 
-    @wp.func
+    @func
     def positive_part(a: mat33) -> mat33:
         """The nearest symmetric positive semidefinite matrix: negative eigenvalues become zero."""
         # a diagonally dominant matrix is positive already

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
@@ -38,7 +39,7 @@ def cavities(triangles: np.ndarray) -> np.ndarray:
     used, local = np.unique(triangles, return_inverse=True)
     local = local.reshape(-1, 3)
     sides = local[:, [[0, 1], [1, 2]]].reshape(-1, 2).T
-    _, part = connected_components(coo_matrix((np.ones(sides.shape[1]), sides), shape=(len(used),) * 2), directed=False)
+    _, part = connected_components(coo_matrix((np.ones(sides.shape[1]), sides), shape=(len(used), len(used))), directed=False)
     _, first = np.unique(part, return_index=True)
     return used[first[part[local[:, 0]]]].astype(np.int32)
 
@@ -64,17 +65,17 @@ def functions(real: Real) -> SimpleNamespace:
     law_type = wp.types.vector(LAW, wide)
     one, least = wp.constant(wide(1.0)), wp.constant(wide(LEAST))
 
-    @wp.func
+    @func
     def overpressure(volume: wide, law: law_type) -> wide:
         part = wp.max(volume / law[4], least)
         return law[0] + law[1] * wp.pow(part, -law[2]) + law[3] * (one - part)
 
-    @wp.func
+    @func
     def stiffness(volume: wide, law: law_type) -> wide:
         part = wp.max(volume / law[4], least)
         return (law[1] * law[2] * wp.pow(part, -law[2] - one) + law[3]) / law[4]
 
-    @wp.func
+    @func
     def log1p(x: wide) -> wide:
         """ln(1 + x) as exact as x (Kahan)."""
         y = one + x
@@ -82,14 +83,14 @@ def functions(real: Real) -> SimpleNamespace:
             return x
         return wp.log(y) * x / (y - one)
 
-    @wp.func
+    @func
     def expm1(x: wide) -> wide:
         y = wp.exp(x)
         if y == one or y - one == -one:
             return wp.where(y == one, x, -one)
         return (y - one) * x / wp.log(y)
 
-    @wp.func
+    @func
     def energy(volume: wide, reference: wide, law: law_type) -> wide:
         """W(volume) - W(reference), as exact as the change of volume: gas and what it works against all but cancel."""
         r = reference / law[4]
@@ -114,6 +115,7 @@ class Cavities:
     """
 
     diagonal = rows = None
+    capacity = 0
 
     def __init__(self, device: Device, real: Real, n: int, s: ConstraintSet):
         self.device, self.real, self._kernels = device, real, kernels(real)
@@ -199,17 +201,17 @@ def kernels(real: Real) -> SimpleNamespace:
     wide, law_type = wp.float64, functions(real).law
     sixth = wp.constant(scalar(1.0 / 6.0))
 
-    @wp.func
+    @func
     def area_normal(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), t: wp.vec3i) -> vec3:
         """Twice the area, along the normal."""
         return wp.cross(edges.edge(base, u, t[0], t[1]), edges.edge(base, u, t[0], t[2]))
 
-    @wp.func
+    @func
     def skew(a: vec3) -> mat33:
         zero = scalar(0.0)
         return mat33(zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def part(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -228,7 +230,7 @@ def kernels(real: Real) -> SimpleNamespace:
         c = edges.wide_edge(base, u, o, t[2])
         volume_out[e] = wp.dot(a, wp.cross(b, c)) / wide(6.0)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def judge(
         first: int,
         count: int,
@@ -244,7 +246,7 @@ def kernels(real: Real) -> SimpleNamespace:
             stiffness_out[c] = scalar(law_of.stiffness(volume[c], laws[c]))
             energy_out[c] = law_of.energy(volume[c], wp.where(reference[c] > wide(0.0), reference[c], laws[c][4]), laws[c])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -265,7 +267,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for c in range(3):
             corners_out[offset + 3 * e + c] = f
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -286,7 +288,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if leader[e] >= 0:
             energy_out[offset + e] = cavity_energy[leader[e]]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -315,7 +317,7 @@ def kernels(real: Real) -> SimpleNamespace:
             blocks_out[at + 2] = -q * skew(edges.edge(base, u, o, t[1]))
             blocks_out[at + 4] = q * skew(edges.edge(base, u, o, t[0]))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather_gradient(
         first: int,
         members: wp.array(dtype=wp.int32),
@@ -332,7 +334,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += area_normal(base, u, vertices[around[k]])
         gradient_out[i] = sixth * total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def multiply(
         first: int,
         members: wp.array(dtype=wp.int32),
@@ -343,7 +345,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         product_out[i] = wide(wp.dot(gradient[i], p[members[i]]))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread(
         first: int,
         members: wp.array(dtype=wp.int32),

@@ -15,6 +15,7 @@ import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
 
@@ -37,14 +38,14 @@ def functions(real: Real) -> SimpleNamespace:
     m, shift = wp.constant(scalar(4.0 / 3.0)), wp.constant(scalar(5.0 / 6.0))
     cofactor = rotation.functions(real).cofactor
 
-    @wp.func
+    @func
     def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
         c = cofactor(f)
         j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
         spring = m * mu * (one - one / (wp.ddot(f, f) + one))
         return spring * f + ((lame + shift * mu) * (j - one) - mu) * c
 
-    @wp.func
+    @func
     def principal(s: vec3, mu: scalar, lame: scalar):
         c = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
         k = lame + shift * mu
@@ -60,13 +61,13 @@ def functions(real: Real) -> SimpleNamespace:
         each = vec3(spring, spring, spring)
         return stretch, each + side, each - side
 
-    @wp.func
+    @func
     def invariants(f: mat33, mu: scalar, lame: scalar) -> vec4:
         k = lame + shift * mu
         fade = one / (wp.ddot(f, f) + one)
         return vec4(m * mu * (one - fade), scalar(2.0) * m * mu * fade * fade, k, k * (wp.determinant(f) - one) - mu)
 
-    @wp.func
+    @func
     def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
         """All terms of first order cancel at rest, and are left out where J > 0, since of them rounding of mu would be left: in terms of
         C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -35,7 +36,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     element = wp.types.vector(1, wp.int32)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def force(
         first: int,
         vertices: wp.array(dtype=element),
@@ -50,7 +51,7 @@ def kernels(real: Real) -> SimpleNamespace:
         e = first + wp.tid()
         corners_out[offset + e] = weight[e] * ((point[e] - base[vertices[e][0]]) - u[vertices[e][0]])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def energy(
         first: int,
         vertices: wp.array(dtype=element),

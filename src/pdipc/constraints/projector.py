@@ -28,6 +28,7 @@ from pdipc.constraints import (
     woven,
 )
 from pdipc.constraints.base import ConstraintSet, merge
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Reducer
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
@@ -59,7 +60,7 @@ KINDS = (
 def kernels_of(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.kernel(module=real.module(__name__))
+    @kernel(real.module(__name__))
     def gather(
         first: int,
         base: wp.array(dtype=vec3),
@@ -74,7 +75,7 @@ def kernels_of(real: Real) -> SimpleNamespace:
             total += corners[slots[k]]
         sum_out[i] = total
 
-    @wp.kernel(module=real.module(__name__))
+    @kernel(real.module(__name__))
     def store(first: int, total: wp.array(dtype=wp.float64), slot: int, out: wp.array(dtype=real.scalar)):
         out[slot] = scalar(total[0])
 

@@ -10,10 +10,10 @@ import functools
 from types import SimpleNamespace
 
 import numpy as np
-import warp as wp
 
 from pdipc.constraints import rows
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 NAME = "quadratic_bending"
@@ -86,7 +86,7 @@ def functions(real: Real) -> SimpleNamespace:
     """project(v, length) = 0."""
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.func
+    @func
     def project(v: vec3, length: scalar) -> vec3:
         return vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 

@@ -27,6 +27,7 @@ import warp as wp
 
 from pdipc.constraints import eigen, tets
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
@@ -77,20 +78,20 @@ def kernels(real: Real) -> SimpleNamespace:
     table = wp.types.matrix((4, CORNERS), wide)
     zero, half, one, two = (wp.constant(wide(value)) for value in (0.0, 0.5, 1.0, 2.0))
 
-    @wp.struct
+    @struct
     class Segment:
-        e: wide3
-        w: wide3
-        d: wide33  # d1, d2 and t in columns
-        length: wide  # |e|
-        along: wide  # w . t
-        across: wide  # w . d1
+        e: wp.vec3d
+        w: wp.vec3d
+        d: wp.mat33d  # d1, d2 and t in columns
+        length: wp.float64  # |e|
+        along: wp.float64  # w . t
+        across: wp.float64  # w . d1
 
-    @wp.func
+    @func
     def column(m: wide33, k: int) -> wide3:
         return wide3(m[0, k], m[1, k], m[2, k])
 
-    @wp.func
+    @func
     def segment(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), i: int, j: int, g: int) -> Segment:
         s = Segment()
         s.e = edges.wide_edge(base, u, i, j)
@@ -104,28 +105,28 @@ def kernels(real: Real) -> SimpleNamespace:
         s.d = wp.matrix_from_cols(d1, wp.cross(t, d1), t)
         return s
 
-    @wp.func
+    @func
     def coupling(r: wide33, c: wide3) -> wide33:
         """M."""
         return half * (r * wp.diag(c) + wp.diag(c) * r)
 
-    @wp.func
+    @func
     def axial(n: wide33) -> wide3:
         return wide3(n[1, 2] - n[2, 1], n[2, 0] - n[0, 2], n[0, 1] - n[1, 0])
 
-    @wp.func
+    @func
     def along_segment(s: Segment, torque: wide3) -> wide3:
         """The transpose of omega(de), applied to a torque."""
         t = column(s.d, 2)
         twist = wp.dot(torque, t) * s.along / (s.length * s.across)
         return wp.cross(torque, t) / s.length - twist * column(s.d, 1)
 
-    @wp.func
+    @func
     def across_segment(s: Segment, torque: wide3) -> wide3:
         """The transpose of omega(dw), applied to a torque."""
         return (wp.dot(torque, column(s.d, 2)) / s.across) * column(s.d, 1)
 
-    @wp.func
+    @func
     def turning(s: Segment):
         """omega(de) and omega(dw) as matrices."""
         t = column(s.d, 2)
@@ -133,11 +134,11 @@ def kernels(real: Real) -> SimpleNamespace:
         by_edge = wp.skew(t) / s.length - (s.along / (s.length * s.across)) * wp.outer(t, d2)
         return by_edge, wp.outer(t, d2) / s.across
 
-    @wp.func
+    @func
     def both(a: wide3, b: wide3) -> wide33:
         return half * (wp.outer(a, b) + wp.outer(b, a))
 
-    @wp.func
+    @func
     def bent(s: Segment, torque: wide3):
         """torque . (what omega changes by): the blocks of de de, de dw and dw dw."""
         d1 = column(s.d, 0)
@@ -154,7 +155,7 @@ def kernels(real: Real) -> SimpleNamespace:
         ww = (-two * t3 / (s.across * s.across)) * both(d1, d2)
         return (c * c) * ee, (half * c / s.across) * ew, ww
 
-    @wp.func
+    @func
     def mirrored(m: wide33) -> wide33:
         """Symmetric: what is below the diagonal as above it."""
         return wide33(
@@ -163,7 +164,7 @@ def kernels(real: Real) -> SimpleNamespace:
             m[0, 2], m[1, 2], m[2, 2],
         )  # fmt: skip
 
-    @wp.func
+    @func
     def plus(total: wide33, part: wide, to: wide4, a: wide33, b: wide33, c: wide33, d: wide33) -> wide33:
         """total + part (to_0 a + to_1 b + to_2 c + to_3 d), one after the other."""
         total = total + (part * to[0]) * a
@@ -171,11 +172,11 @@ def kernels(real: Real) -> SimpleNamespace:
         total = total + (part * to[2]) * c
         return total + (part * to[3]) * d
 
-    @wp.func
+    @func
     def narrow(a: wide3) -> vec3:
         return vec3(scalar(a[0]), scalar(a[1]), scalar(a[2]))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def force(
         first: int,
         vertices: wp.array(dtype=element),
@@ -203,7 +204,7 @@ def kernels(real: Real) -> SimpleNamespace:
         corners_out[at + 3] = narrow(wa)
         corners_out[at + 4] = narrow(wb)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def energy(
         first: int,
         vertices: wp.array(dtype=element),
@@ -228,7 +229,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += half * half * stiffness[i][k] * lengths
         energy_out[offset + i] = wide(weight[i]) * total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hessian(
         first: int,
         vertices: wp.array(dtype=element),

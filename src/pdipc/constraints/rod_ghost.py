@@ -12,6 +12,7 @@ import warp as wp
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -41,12 +42,12 @@ def kernels(real: Real) -> SimpleNamespace:
     edges = tets.functions(real)
     half, one = wp.constant(scalar(0.5)), wp.constant(scalar(1.0))
 
-    @wp.func
+    @func
     def parts(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: wp.vec3i):
         e = edges.edge(base, u, v[0], v[1])
         return e, edges.edge(base, u, v[0], v[2]) - half * e
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -68,7 +69,7 @@ def kernels(real: Real) -> SimpleNamespace:
         corners_out[offset + 3 * i + 1] = on_e - half * on_w
         corners_out[offset + 3 * i + 2] = on_w
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -88,7 +89,7 @@ def kernels(real: Real) -> SimpleNamespace:
         lean = wp.dot(w, e) / wide(span[i])
         energy_out[offset + i] = wide(0.5) * wide(weight[i]) * (longer * longer + lean * lean)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 REFINEMENTS = 2  # of the SVD's rotation
@@ -30,7 +31,7 @@ def functions(real: Real) -> SimpleNamespace:
     one, zero = wp.constant(scalar(1.0)), wp.constant(scalar(0.0))
     settled = wp.constant(scalar(8.0 * real.unit_roundoff))
 
-    @wp.func
+    @func
     def cofactor(f: mat33) -> mat33:
         """cof F = det(F) F^-T: its columns are the cross products of the columns of F."""
         a = vec3(f[0, 0], f[1, 0], f[2, 0])
@@ -38,14 +39,14 @@ def functions(real: Real) -> SimpleNamespace:
         c = vec3(f[0, 2], f[1, 2], f[2, 2])
         return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
 
-    @wp.func
+    @func
     def orthonormalized(r: mat33) -> mat33:
         """R (3 I - R^T R) / 2: squares the deviation from orthogonality."""
         g = wp.transpose(r) * r
         half = scalar(0.5)
         return scalar(1.5) * r - half * (r * g)
 
-    @wp.func
+    @func
     def rotation_by_svd(f: mat33) -> mat33:
         """The nearest rotation by a singular value decomposition: robust, and several times slower."""
         u = mat33()
@@ -65,7 +66,7 @@ def functions(real: Real) -> SimpleNamespace:
             r = u * wp.transpose(v)
         return orthonormalized(orthonormalized(r))
 
-    @wp.func
+    @func
     def refined(f: mat33, rotation: mat33) -> mat33:
         """Newton's method for R^T F symmetric, from a rotation near that: Warp's SVD in float32 is good to 1e-3 only."""
         r = rotation
@@ -81,7 +82,7 @@ def functions(real: Real) -> SimpleNamespace:
                 r = orthonormalized(orthonormalized(r + r * wp.skew(turn)))
         return r
 
-    @wp.func
+    @func
     def nearest_rotation(f: mat33) -> mat33:
         """argmin over rotations R of |F - R|_F; the identity for F = 0."""
         size_sq = wp.ddot(f, f)

@@ -7,9 +7,9 @@ import warp as wp
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import kernel as named
 from pdipc.device.precision import real as real_of
 
 
@@ -24,7 +24,7 @@ def keep_length(real: Real) -> Callable:
     """project(v, length): the nearest vector of that length; a fixed direction where v = 0."""
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.func
+    @func
     def project(v: vec3, length: scalar) -> vec3:
         size = wp.length(v)
         if size > scalar(0.0):
@@ -38,7 +38,7 @@ def limit_length(real: Real) -> Callable:
     """project(v, length): the nearest vector that is no longer."""
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.func
+    @func
     def project(v: vec3, length: scalar) -> vec3:
         size = wp.length(v)
         if size > length:
@@ -71,7 +71,7 @@ def kernels(
     wide = wp.float64
     slackens = wp.constant(1 if pulls else 0)
 
-    @wp.func
+    @func
     def combined(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: element, g: row) -> vec3:
         """G x; the g_c add up to zero, so it is a sum over differences."""
         total = vec3()
@@ -79,14 +79,14 @@ def kernels(
             total += g[c] * edges.edge(base, u, v[0], v[c])
         return total
 
-    @wp.func
+    @func
     def wide_combined(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), v: element, g: row) -> wp.vec3d:
         total = wp.vec3d()
         for c in range(1, count):
             total += wide(g[c]) * edges.wide_edge(base, u, v[0], v[c])
         return total
 
-    @named(module, "force")
+    @kernel(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=element),
@@ -106,7 +106,7 @@ def kernels(
         for c in range(count):
             corners_out[offset + count * e + c] = g[e][c] * pull
 
-    @named(module, "energy")
+    @kernel(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=element),
@@ -125,7 +125,7 @@ def kernels(
     if not bends:
         return SimpleNamespace(force=force, energy=energy)
 
-    @named(module, "hessian")
+    @kernel(module, "hessian")
     def hessian(
         first: int,
         vertices: wp.array(dtype=element),

@@ -19,9 +19,9 @@ import warp as wp
 
 from pdipc.constraints import triangles
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import kernel as named
 from pdipc.device.precision import real as real_of
 
 NAME = "strain_limit"
@@ -52,7 +52,7 @@ def functions(real: Real) -> SimpleNamespace:
     begin, width = wp.constant(scalar(BEGIN)), wp.constant(scalar(END - BEGIN))
     firm, zero, one, two = (wp.constant(scalar(value)) for value in (FIRM, 0.0, 1.0, 2.0))
 
-    @wp.func
+    @func
     def barrier(s: scalar, limit: scalar) -> vec3:
         t = ((s - one) / limit - begin) / width  # from 0 to 1
         if t <= zero:
@@ -79,7 +79,7 @@ def kernels(real: Real) -> SimpleNamespace:
     barrier, wide_barrier = functions(real).barrier, functions(real_of("float64")).barrier
     wide, tiny, close = wp.float64, wp.constant(scalar(1.0e-3)), wp.constant(scalar(CLOSE[real.name]))
 
-    @named(module, "force")
+    @kernel(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -111,7 +111,7 @@ def kernels(real: Real) -> SimpleNamespace:
         corners_out[corner + 1] = one
         corners_out[corner + 2] = other
 
-    @named(module, "energy")
+    @kernel(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -129,7 +129,7 @@ def kernels(real: Real) -> SimpleNamespace:
         total = wide_barrier(s1, wide(limit[e]))[0] + wide_barrier(s2, wide(limit[e]))[0]
         energy_out[offset + e] = wide(weight[e]) * total
 
-    @named(module, "hessian")
+    @kernel(module, "hessian")
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),

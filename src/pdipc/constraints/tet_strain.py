@@ -8,6 +8,7 @@ import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 NAME = "tet_strain"
@@ -34,7 +35,7 @@ def functions(real: Real) -> SimpleNamespace:
     two = wp.constant(scalar(2.0))
     least = wp.constant(scalar(1.0e-6))
 
-    @wp.func
+    @func
     def principal(s: vec3, mu: scalar, lame: scalar):
         twist = vec3(
             one - two / wp.max(s[1] + s[2], least),

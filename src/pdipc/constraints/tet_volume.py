@@ -12,6 +12,7 @@ import warp as wp
 
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 NAME = "tet_volume"
@@ -40,7 +41,7 @@ def functions(real: Real) -> SimpleNamespace:
     rot = rotation.functions(real)
     settled = wp.constant(scalar(SETTLED[real.name]))
 
-    @wp.func
+    @func
     def project(f: mat33) -> mat33:
         """The nearest P with det P = 1; where the iteration finds none (F of rank one or less), the nearest rotation."""
         p = f
@@ -62,14 +63,14 @@ def functions(real: Real) -> SimpleNamespace:
             return rot.nearest_rotation(f)
         return p
 
-    @wp.func
+    @func
     def away_from_zero(a: scalar) -> scalar:
         """a, but no nearer to zero than a thousandth: where the nearest matrix jumps, its derivative has no bound."""
         if wp.abs(a) < least:
             return wp.where(a < zero, -least, least)
         return a
 
-    @wp.func
+    @func
     def principal(s: vec3, mu: scalar, lame: scalar):
         f = mat33(
             s[0], zero, zero,

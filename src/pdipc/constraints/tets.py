@@ -25,9 +25,9 @@ import warp as wp
 
 from pdipc.constraints import eigen, rotation
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import kernel as named
 from pdipc.device.precision import real as real_of
 
 CORNERS = 4
@@ -70,22 +70,22 @@ def functions(real: Real) -> SimpleNamespace:
     eig, rot = eigen.functions(real), rotation.functions(real)
     zero = wp.constant(scalar(0.0))
 
-    @wp.func
+    @func
     def edge(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), a: int, b: int) -> vec3:
         """(base + u)_b - (base + u)_a: differences first, so that small displacements of far positions are not lost."""
         return (base[b] - base[a]) + (u[b] - u[a])
 
-    @wp.func
+    @func
     def wide_edge(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), a: int, b: int) -> wide3:
         """The same in double precision."""
         e = wide3(wide(base[b][0]) - wide(base[a][0]), wide(base[b][1]) - wide(base[a][1]), wide(base[b][2]) - wide(base[a][2]))
         return e + wide3(wide(u[b][0]) - wide(u[a][0]), wide(u[b][1]) - wide(u[a][1]), wide(u[b][2]) - wide(u[a][2]))
 
-    @wp.func
+    @func
     def deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), q: wp.vec4i, inverse: mat33) -> mat33:
         return wp.matrix_from_cols(edge(base, u, q[0], q[1]), edge(base, u, q[0], q[2]), edge(base, u, q[0], q[3])) * inverse
 
-    @wp.func
+    @func
     def widened(a: mat33) -> wide33:
         return wide33(
             wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
@@ -93,7 +93,7 @@ def functions(real: Real) -> SimpleNamespace:
             wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
         )  # fmt: skip
 
-    @wp.func
+    @func
     def narrowed(a: wide33) -> mat33:
         return mat33(
             scalar(a[0, 0]), scalar(a[0, 1]), scalar(a[0, 2]),
@@ -101,19 +101,19 @@ def functions(real: Real) -> SimpleNamespace:
             scalar(a[2, 0]), scalar(a[2, 1]), scalar(a[2, 2]),
         )  # fmt: skip
 
-    @wp.func
+    @func
     def wide_deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), q: wp.vec4i, inverse: mat33) -> wide33:
         e = wp.matrix_from_cols(wide_edge(base, u, q[0], q[1]), wide_edge(base, u, q[0], q[2]), wide_edge(base, u, q[0], q[3]))
         return e * widened(inverse)
 
-    @wp.func
+    @func
     def singular_values(f: mat33):
         """Signed s, U and V with F = U diag(s) V^T, both rotations: from the polar decomposition."""
         r = rot.nearest_rotation(f)
         s, v = eig.symmetric(wp.transpose(r) * f)
         return s, r * v, v
 
-    @wp.func
+    @func
     def block(stretch: mat33, p: vec3, q: vec3, a: vec3, b: vec3) -> mat33:
         """The Hessian between two corners whose gradients are a and b, all in the axes of the singular values."""
         return mat33(
@@ -128,11 +128,11 @@ def functions(real: Real) -> SimpleNamespace:
             stretch[2, 2] * a[2] * b[2] + p[1] * a[0] * b[0] + p[0] * a[1] * b[1],
         )  # fmt: skip
 
-    @wp.func
+    @func
     def skew(a: vec3) -> mat33:
         return mat33(zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero)
 
-    @wp.func
+    @func
     def plain_block(i: vec4, f: mat33, cofactors: mat33, a: vec3, b: vec3) -> mat33:
         """The same from the factors `i` of the invariants, in the scene's axes: d^2 J = det(dx_a, dx_b, F (a x b))."""
         outer = i[1] * wp.outer(f * a, f * b) + i[2] * wp.outer(cofactors * a, cofactors * b)
@@ -161,7 +161,7 @@ def kernels(
     half, zero, wide = wp.constant(scalar(0.5)), wp.constant(scalar(0.0)), wp.float64
     plain = invariants
 
-    @named(module, "force")
+    @kernel(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec4i),
@@ -187,7 +187,7 @@ def kernels(
         corners_out[corner + 2] = f2
         corners_out[corner + 3] = f3
 
-    @named(module, "energy")
+    @kernel(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec4i),
@@ -203,7 +203,7 @@ def kernels(
         f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
         energy_out[offset + e] = wp.float64(weight[e]) * density(f, wp.float64(modulus[e][0]), wp.float64(modulus[e][1]))
 
-    @named(module, "hessian")
+    @kernel(module, "hessian")
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec4i),
@@ -270,11 +270,11 @@ def projective(real: Real, module: wp.Module, project_of: Callable[[Real], Calla
     """Kernels of a kind whose energy is |F - P|^2 / 2, P the projection of F: project_of(real) makes project(F) -> P."""
     project = project_of(real_of("float64"))
 
-    @wp.func
+    @func
     def stress(f: wp.mat33d, mu: wp.float64, lame: wp.float64) -> wp.mat33d:
         return f - project(f)
 
-    @wp.func
+    @func
     def density(f: wp.mat33d, mu: wp.float64, lame: wp.float64) -> wp.float64:
         d = f - project(f)
         return wp.float64(0.5) * wp.ddot(d, d)

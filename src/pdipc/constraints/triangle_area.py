@@ -12,6 +12,7 @@ import warp as wp
 from pdipc.constraints import triangle_strain, triangles
 from pdipc.constraints.base import ConstraintSet
 from pdipc.constraints.tet_volume import ITERATIONS, SETTLED
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 NAME = "triangle_area"
@@ -38,7 +39,7 @@ def functions(real: Real) -> SimpleNamespace:
     isometry = triangle_strain.functions(real).project
     settled = wp.constant(scalar(SETTLED[real.name]))
 
-    @wp.func
+    @func
     def project(f1: vec3, f2: vec3) -> mat23:
         n = normal(f1, f2)
         p1 = f1
@@ -65,14 +66,14 @@ def functions(real: Real) -> SimpleNamespace:
             return isometry(f1, f2)
         return mat23(p1[0], p1[1], p1[2], p2[0], p2[1], p2[2])
 
-    @wp.func
+    @func
     def away_from_zero(a: scalar) -> scalar:
         """a, but no nearer to zero than a thousandth."""
         if wp.abs(a) < least:
             return wp.where(a < zero, -least, least)
         return a
 
-    @wp.func
+    @func
     def principal(s1: scalar, s2: scalar):
         near = project(vec3(s1, zero, zero), vec3(zero, s2, zero))
         p1 = away_from_zero(near[0, 0])

@@ -12,6 +12,7 @@ import warp as wp
 
 from pdipc.constraints import triangles
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import func
 from pdipc.device.precision import Real
 
 NAME = "triangle_strain"
@@ -33,7 +34,7 @@ def functions(real: Real) -> SimpleNamespace:
     mat23 = wp.types.matrix((2, 3), scalar)
     normal = triangles.normal_function(real)
 
-    @wp.func
+    @func
     def project(f1: vec3, f2: vec3) -> mat23:
         n = normal(f1, f2)
         p1 = f1 + wp.cross(f2, n)
@@ -47,7 +48,7 @@ def functions(real: Real) -> SimpleNamespace:
             p2 = vec3(scalar(0.0), scalar(1.0), scalar(0.0))
         return mat23(p1[0], p1[1], p1[2], p2[0], p2[1], p2[2])
 
-    @wp.func
+    @func
     def principal(s1: scalar, s2: scalar):
         twist = one - scalar(2.0) / wp.max(s1 + s2, least)
         tilt = vec2(one - one / wp.max(s1, least), one - one / wp.max(s2, least))

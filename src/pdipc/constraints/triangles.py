@@ -9,9 +9,9 @@ import warp as wp
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import kernel as named
 from pdipc.device.precision import real as real_of
 
 CORNERS = 3
@@ -80,7 +80,7 @@ def functions(real: Real) -> SimpleNamespace:
     wide = wp.float64
     wide23 = wp.types.matrix((2, 3), wide)
 
-    @wp.func
+    @func
     def deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), t: wp.vec3i, b: mat22) -> mat23:
         """The columns of F as rows."""
         e1 = edges.edge(base, u, t[0], t[1])
@@ -89,7 +89,7 @@ def functions(real: Real) -> SimpleNamespace:
         f2 = b[0, 1] * e1 + b[1, 1] * e2
         return mat23(f1[0], f1[1], f1[2], f2[0], f2[1], f2[2])
 
-    @wp.func
+    @func
     def wide_deformation(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), t: wp.vec3i, b: mat22) -> wide23:
         e1 = edges.wide_edge(base, u, t[0], t[1])
         e2 = edges.wide_edge(base, u, t[0], t[2])
@@ -107,7 +107,7 @@ def hessians(real: Real) -> SimpleNamespace:
     normal = normal_function(real)
     zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
 
-    @wp.func
+    @func
     def block(k: vec3, p: scalar, q: scalar, tilt: vec2, u1: vec3, u2: vec3, n: vec3, a: vec2, b: vec2) -> mat33:
         """The Hessian between two corners of gradients a and b in the axes of the singular values."""
         h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
@@ -117,7 +117,7 @@ def hessians(real: Real) -> SimpleNamespace:
         hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
         return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
 
-    @wp.func
+    @func
     def axes(f1: vec3, f2: vec3):
         """F^T F = V diag(s^2) V^T, V the rotation by `angle`; s1 and s2 follow from their sum and difference of squares without cancellation."""
         n = normal(f1, f2)
@@ -139,7 +139,7 @@ def hessians(real: Real) -> SimpleNamespace:
         return angle, s1, s2, u1, u2, n
 
     # Arguments: an element in its own axes, and where its blocks go.
-    @wp.func
+    @func
     def write(
         stretch: vec3,
         pair: vec2,
@@ -202,7 +202,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     project = project_of(real_of("float64"))
     f_of, own = functions(real), hessians(real)
 
-    @named(module, "force")
+    @kernel(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -227,7 +227,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         corners_out[corner + 1] = g1
         corners_out[corner + 2] = g2
 
-    @named(module, "energy")
+    @kernel(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -243,7 +243,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         d = project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.ddot(d, d)
 
-    @named(module, "hessian")
+    @kernel(module, "hessian")
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -269,7 +269,7 @@ def normal_function(real: Real):
     """normal(f1, f2): the unit normal of a deformed triangle; where it has no area, a fixed choice across its longer side."""
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.func
+    @func
     def normal(f1: vec3, f2: vec3) -> vec3:
         c = wp.cross(f1, f2)
         size = wp.length(c)

@@ -16,9 +16,9 @@ import warp as wp
 
 from pdipc.constraints import triangles
 from pdipc.constraints.base import ConstraintSet
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import kernel as named
 
 NAME = "woven"
 CORNERS = triangles.CORNERS
@@ -47,7 +47,7 @@ def kernels(real: Real) -> SimpleNamespace:
     wide, one, zero, half = wp.float64, wp.constant(scalar(1.0)), wp.constant(scalar(0.0)), wp.constant(scalar(0.5))
     least = wp.constant(scalar(1.0e-6))
 
-    @named(module, "force")
+    @kernel(module, "force")
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -81,7 +81,7 @@ def kernels(real: Real) -> SimpleNamespace:
         corners_out[corner + 1] = g1
         corners_out[corner + 2] = g2
 
-    @named(module, "energy")
+    @kernel(module, "energy")
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
@@ -104,7 +104,7 @@ def kernels(real: Real) -> SimpleNamespace:
         total = wide(c[0]) * e1 * e1 + wide(c[1]) * e2 * e2 + wide(2.0) * wide(c[2]) * e1 * e2 + wide(c[3]) * g * g
         energy_out[offset + e] = wide(0.5) * wide(weight[e]) * total
 
-    @named(module, "hessian")
+    @kernel(module, "hessian")
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),

@@ -5,7 +5,8 @@ Warp's own `tile_extract` takes memory that the threads of a CPU would have to s
 
 import functools
 
-import warp as wp
+from pdipc.device import language
+from pdipc.device.language import Function
 
 _REDUCE = """
 #if WP_TILE_BLOCK_DIM == 1
@@ -20,30 +21,30 @@ _REDUCE = """
 
 
 @functools.cache
-def total(dtype: type) -> wp.Function:
+def total(dtype: type) -> Function:
     """The sum over the threads of a block, in one order, for each of them. dtype: of the numbers, vectors or matrices."""
 
-    @wp.func_native(_REDUCE.replace("OPERATION", "wp::add(a, b)"))
+    @language.func_native(_REDUCE.replace("OPERATION", "wp::add(a, b)"))
     def block_total(value: dtype) -> dtype: ...
 
-    return block_total  # pyright: ignore[reportReturnType]  (Warp types functions as what they decorate)
+    return block_total
 
 
 @functools.cache
-def least(dtype: type) -> wp.Function:
+def least(dtype: type) -> Function:
     """The least of what the threads of a block have."""
 
-    @wp.func_native(_REDUCE.replace("OPERATION", "wp::min(a, b)"))
+    @language.func_native(_REDUCE.replace("OPERATION", "wp::min(a, b)"))
     def block_least(value: dtype) -> dtype: ...
 
-    return block_least  # pyright: ignore[reportReturnType]
+    return block_least
 
 
 @functools.cache
-def largest(dtype: type) -> wp.Function:
+def largest(dtype: type) -> Function:
     """The largest of what the threads of a block have."""
 
-    @wp.func_native(_REDUCE.replace("OPERATION", "wp::max(a, b)"))
+    @language.func_native(_REDUCE.replace("OPERATION", "wp::max(a, b)"))
     def block_largest(value: dtype) -> dtype: ...
 
-    return block_largest  # pyright: ignore[reportReturnType]
+    return block_largest

@@ -23,12 +23,14 @@ import itertools
 import queue
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from pdipc.device import blocks, system
 from pdipc.device import threads as shared
+from pdipc.device.language import Kernel, func, kernel, struct
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
 
@@ -42,7 +44,7 @@ BLOCK = 256  # threads of a block on CUDA where they work together
 WIDE_BLOCKS = 1024  # blocks that share a sum on CUDA; more numbers make longer strides
 
 
-@wp.struct
+@struct
 class Span:
     """How a list is shared: worker `first + tid` takes every `step`-th block of `block` entries."""
 
@@ -187,11 +189,11 @@ class Device:
             )
 
     def _meet(self) -> None:
-        if self.threads > 1:
+        if self._meeting is not None and self.threads > 1:
             wp.launch(system.meet_kernel(), dim=1, inputs=system.meet_inputs(self._meeting, self.threads), device=self.warp)
 
     @one_at_a_time
-    def launch(self, kernel: wp.Kernel, dim: int, inputs: Sequence[Any], grain: int = 1) -> None:
+    def launch(self, kernel: Kernel, dim: int, inputs: Sequence[Any], grain: int = 1) -> None:
         """Runs `kernel(first, *inputs)` for indices 0 to dim - 1; each index is worth `grain` simple operations."""
         if self.is_cuda:
             wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
@@ -213,7 +215,7 @@ class Device:
             _together([command.launch for command in commands])
 
     @one_at_a_time
-    def launch_blocks(self, kernel: wp.Kernel, blocks: int, inputs: Sequence[Any], grain: int = BLOCK) -> None:
+    def launch_blocks(self, kernel: Kernel, blocks: int, inputs: Sequence[Any], grain: int = BLOCK) -> None:
         """Runs `kernel(first, *inputs)` for indices 0 to blocks - 1, each by a block of threads on CUDA and by one on the CPU."""
         if self.wide:
             wp.launch(kernel, dim=blocks * BLOCK, inputs=[0, *inputs], device=self.warp, block_dim=BLOCK)
@@ -221,7 +223,7 @@ class Device:
             self.launch(kernel, blocks, inputs, grain)
 
     @one_at_a_time
-    def launch_list(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
+    def launch_list(self, kernel: Kernel, capacity: int, inputs: Sequence[Any]) -> None:
         """Runs `kernel(span, *inputs)` over a list of at most `capacity` entries whose length the kernel reads itself."""
         if self.is_cuda:
             workers = max(1, min(capacity, CUDA_WORKERS))
@@ -242,7 +244,7 @@ class Device:
             _together([command.launch for command in commands])
 
     @one_at_a_time
-    def launch_serial(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
+    def launch_serial(self, kernel: Kernel, inputs: Sequence[Any]) -> None:
         """Runs `kernel(0, *inputs)` once, in one thread: the last step of a sum, a counter, a decision."""
         if self._recording is None or self._recording == 0:
             wp.launch(kernel, dim=1, inputs=[0, *inputs], device=self.warp)
@@ -250,7 +252,7 @@ class Device:
             self._meet()
 
     @one_at_a_time
-    def launch_scatter(self, kernel: wp.Kernel, capacity: int, inputs: Sequence[Any]) -> None:
+    def launch_scatter(self, kernel: Kernel, capacity: int, inputs: Sequence[Any]) -> None:
         """Runs a kernel over a list that counts with integer atomics: in one thread on the CPU, where those are not atomic."""
         if self.is_cuda:
             self.launch_list(kernel, capacity, inputs)
@@ -285,9 +287,9 @@ class Device:
         if self.wide:
             n = counts.size
             k = scan_kernels()
-            self.launch_blocks(k["scan_blocks"], -(-n // BLOCK), [n, counts, ends_out])
-            self.launch_blocks(k["scan_ends"], 1, [n, ends_out])
-            self.launch(k["add_ends"], n, [BLOCK, ends_out])
+            self.launch_blocks(k.scan_blocks, -(-n // BLOCK), [n, counts, ends_out])
+            self.launch_blocks(k.scan_ends, 1, [n, ends_out])
+            self.launch(k.add_ends, n, [BLOCK, ends_out])
         else:
             self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
 
@@ -311,7 +313,7 @@ class Device:
             with wp.ScopedCapture(device=self.warp) as capture:
                 launches()
             return Graph(self, [capture.graph], (launches, keep_alive))
-        wp.load_module(system.meet_kernel().module, device=self.warp)
+        wp.load_module(system.meeting_module(), device=self.warp)
         graphs = []
         try:
             for part in range(self.threads):
@@ -331,7 +333,7 @@ def _span(first: int, step: int, block: int) -> Any:
 
 
 @functools.cache
-def scan_kernels() -> dict[str, wp.Kernel]:
+def scan_kernels() -> SimpleNamespace:
     """Inclusive sums in place of an array: within blocks, over the ends of blocks, then ends are added to the blocks after them.
 
     The last number of each block is final after the second kernel, so no other memory is needed.
@@ -339,7 +341,7 @@ def scan_kernels() -> dict[str, wp.Kernel]:
     module = wp.get_module(f"{__name__}.scan")
     module.options["enable_backward"] = False
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def scan_blocks(first: int, count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
         i = first + wp.tid()
         value = int(0)
@@ -349,7 +351,7 @@ def scan_kernels() -> dict[str, wp.Kernel]:
         if i < count:
             ends_out[i] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def scan_ends(first: int, count: int, ends: wp.array(dtype=wp.int32)):
         """Runs in one block of threads."""
         lane = first + wp.tid()
@@ -366,24 +368,24 @@ def scan_kernels() -> dict[str, wp.Kernel]:
                 ends[last] = total
             before += wp.tile_extract(wp.tile_sum(values), 0)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_ends(first: int, size: int, ends: wp.array(dtype=wp.int32)):
         i = first + wp.tid()
         if i >= size and i % size != size - 1:
             ends[i] = ends[i] + ends[i // size * size - 1]
 
-    return {"scan_blocks": scan_blocks, "scan_ends": scan_ends, "add_ends": add_ends}  # pyright: ignore[reportReturnType]
+    return SimpleNamespace(scan_blocks=scan_blocks, scan_ends=scan_ends, add_ends=add_ends)
 
 
 @functools.cache
-def kernels(real: Real) -> dict[str, wp.Kernel]:
+def kernels(real: Real) -> SimpleNamespace:
     """Sums and largest values that do not depend on the number of threads: fixed blocks, then one worker, or block, over the blocks."""
     scalar = real.scalar
     module = real.module(__name__)
     block = wp.constant(REDUCE_BLOCK)
     block_total, block_largest = blocks.total(scalar), blocks.largest(scalar)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sum_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
         b = first + wp.tid()
         total = scalar(0.0)
@@ -391,14 +393,14 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             total += values[i]
         partial_out[b] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sum_partials(first: int, partial: wp.array(dtype=scalar), slots: int, out: wp.array(dtype=scalar), slot: int):
         total = scalar(0.0)
         for b in range(slots):
             total += partial[b]
         out[slot] = total
 
-    @wp.func
+    @func
     def one_of(which: int, i: int, a: wp.array(dtype=scalar), b: wp.array(dtype=scalar), c: wp.array(dtype=scalar)):
         value = scalar(0.0)
         if which == 0:
@@ -409,7 +411,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
             value = c[i]
         return value
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def max_parts(
         first: int,
         a: wp.array(dtype=scalar),
@@ -433,7 +435,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         if lane == 0:
             partial_out[block] = largest
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def max_of_parts(first: int, partial: wp.array(dtype=scalar), blocks: int, slots: wp.vec3i, out: wp.array(dtype=scalar)):
         """A block of threads for each array."""
         worker = first + wp.tid()
@@ -446,7 +448,7 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         if lane == 0:
             out[slots[which]] = largest
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def wide_sum(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
         """Sums of every `stride`-th number from that of the thread on, by block."""
         worker = first + wp.tid()
@@ -457,13 +459,13 @@ def kernels(real: Real) -> dict[str, wp.Kernel]:
         if worker % wp.block_dim() == 0:
             out[slot + worker // wp.block_dim()] = total
 
-    return {
-        "sum_blocks": sum_blocks,
-        "sum_partials": sum_partials,
-        "max_parts": max_parts,
-        "max_of_parts": max_of_parts,
-        "wide_sum": wide_sum,
-    }  # pyright: ignore[reportReturnType]
+    return SimpleNamespace(
+        sum_blocks=sum_blocks,
+        sum_partials=sum_partials,
+        max_parts=max_parts,
+        max_of_parts=max_of_parts,
+        wide_sum=wide_sum,
+    )
 
 
 class Largest:
@@ -479,10 +481,10 @@ class Largest:
     def find(self, values: Sequence[wp.array], out: wp.array, slots: Sequence[int]) -> None:
         """Launches out[slots[k]] = largest of values[k]."""
         k, device, fill = self.kernels, self.device, 3 - self.arrays
-        inputs = [*values, *values[:1] * fill, self.counts, self.blocks, self.part, self.partial]
-        device.launch_blocks(k["max_parts"], self.arrays * self.blocks, inputs, grain=REDUCE_BLOCK // 8)
+        inputs = [*values, *[values[0]] * fill, self.counts, self.blocks, self.part, self.partial]
+        device.launch_blocks(k.max_parts, self.arrays * self.blocks, inputs, grain=REDUCE_BLOCK // 8)
         inputs = [self.partial, self.blocks, wp.vec3i(*slots, *[0] * fill), out]
-        device.launch_blocks(k["max_of_parts"], self.arrays, inputs, grain=1)
+        device.launch_blocks(k.max_of_parts, self.arrays, inputs, grain=1)
 
 
 class Reducer:
@@ -500,11 +502,11 @@ class Reducer:
         k, device = self.kernels, self.device
         if device.wide:
             many = self.blocks * BLOCK
-            device.launch_blocks(k["wide_sum"], self.blocks, [values, self.count, many, self.partial, 0])
-            device.launch_blocks(k["wide_sum"], 1, [self.partial, self.blocks, BLOCK, out, slot])
+            device.launch_blocks(k.wide_sum, self.blocks, [values, self.count, many, self.partial, 0])
+            device.launch_blocks(k.wide_sum, 1, [self.partial, self.blocks, BLOCK, out, slot])
         else:
-            device.launch(k["sum_blocks"], self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
-            device.launch_serial(k["sum_partials"], [self.partial, self.blocks, out, slot])
+            device.launch(k.sum_blocks, self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
+            device.launch_serial(k.sum_partials, [self.partial, self.blocks, out, slot])
 
     def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = largest of values[0:count]."""

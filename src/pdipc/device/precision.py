@@ -9,12 +9,13 @@ needs a type of its own, such as a struct with arrays, a factory `functions(real
 """
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
+
+from pdipc.device.language import func
 
 wp.config.log_level = wp.LOG_WARNING  # no banner; every module that uses Warp imports this one
 
@@ -23,13 +24,13 @@ Scalar = wp.Float
 Vec3, Vec4, Mat33 = wp.types.vector(3, wp.Float), wp.types.vector(4, wp.Float), wp.types.matrix((3, 3), wp.Float)
 
 
-@wp.func
+@func
 def unit_roundoff(like: wp.float64):
     """Half the spacing of numbers just above one, in the type of `like`."""
     return wp.float64(wp.static(2.0**-53))
 
 
-@wp.func
+@func
 def unit_roundoff(like: wp.float32):  # noqa: F811
     return wp.float32(wp.static(2.0**-24))
 
@@ -60,16 +61,6 @@ class Real:
         module = wp.get_module(f"{name}.{self.name}")
         module.options["enable_backward"] = False
         return module
-
-
-def kernel(module: wp.Module, name: str) -> Callable[[Callable], wp.Kernel]:
-    """Decorator: a kernel called `name`. For kernels that one function makes several of: recorded graphs find kernels by name."""
-
-    def make(function: Callable) -> wp.Kernel:
-        function.__qualname__ = name
-        return wp.kernel(function, module=module)  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
-
-    return make
 
 
 @functools.cache

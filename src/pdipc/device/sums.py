@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.device import blocks
+from pdipc.device.language import kernel
 from pdipc.device.launch import BLOCK, Device
 
 
@@ -17,7 +18,7 @@ def kernels() -> SimpleNamespace:
     module.options["enable_backward"] = False
     block_total = blocks.total(wp.float64)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_blocks(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -40,7 +41,7 @@ def kernels() -> SimpleNamespace:
         if worker % wp.block_dim() == 0:
             partial_out[b] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_bodies(
         first: int,
         offsets: wp.array(dtype=wp.int32),

@@ -16,6 +16,8 @@ from typing import Any
 
 import warp as wp
 
+from pdipc.device import language
+from pdipc.device.language import Kernel, kernel
 from pdipc.device.threads import cores
 
 # Threads meet after each kernel of a recorded graph. The last to arrive wakes the others. Those spin at first, since what they wait
@@ -89,7 +91,7 @@ SPINS = 4000  # looks at the others before a thread sleeps or gives way, at most
 
 
 def _address(function: Any) -> wp.uint64:
-    return wp.uint64(ctypes.cast(function, ctypes.c_void_p).value)
+    return wp.uint64(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
 
 @functools.cache
@@ -135,20 +137,26 @@ def start_warp() -> None:
 MEETING = 64  # int32 that threads meet in: four counters, each in a cache line of its own
 
 
-@functools.cache
-def meet_kernel() -> wp.Kernel:
-    """A kernel that ends when all threads have called it."""
+def meeting_module() -> wp.Module:
+    """Of `meet_kernel`."""
     module = wp.get_module(f"{__name__}.meet")
     module.options["enable_backward"] = False
+    return module
 
-    @wp.func_native(_MEET)
+
+@functools.cache
+def meet_kernel() -> Kernel:
+    """A kernel that ends when all threads have called it."""
+    module = meeting_module()
+
+    @language.func_native(_MEET)
     def meet(meeting: wp.array(dtype=wp.int32), threads: int, spin_limit: int, wait_call: wp.uint64, futex_number: int): ...
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def meet_others(meeting: wp.array(dtype=wp.int32), threads: int, spin_limit: int, wait_call: wp.uint64, futex_number: int):
         meet(meeting, threads, spin_limit, wait_call, futex_number)
 
-    return meet_others  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return meet_others
 
 
 def meet_inputs(meeting: wp.array, threads: int) -> list[Any]:
@@ -163,7 +171,7 @@ def meet_inputs(meeting: wp.array, threads: int) -> list[Any]:
 def milliseconds() -> Any:
     """Warp function (clock_call, clock_argument) -> ms since some moment; on the device in CUDA."""
 
-    @wp.func_native(_CLOCK)
+    @language.func_native(_CLOCK)
     def milliseconds(clock_call: wp.uint64, clock_argument: wp.int64) -> wp.float64: ...
 
     return milliseconds

@@ -100,12 +100,13 @@ class _Surfaces:
 def export_ply(run: Run, folder: Path) -> Path:
     """frame_000000.ply, ...: the surfaces, binary, in float64, each triangle with its body's number; rods as tubes, after all vertices."""
     import trimesh
+    from trimesh.exchange.ply import export_ply as written
 
     drawn = _Surfaces(run)
     for frame in range(run.frame_count):
         mesh = trimesh.Trimesh(drawn.points(run.positions(frame)), drawn.triangles, process=False)
         mesh.face_attributes["body"] = drawn.body.astype(np.int32)
-        data = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False, include_attributes=True)
+        data = written(mesh, vertex_normal=False, include_attributes=True)
         (folder / f"frame_{frame:06d}.ply").write_bytes(data)
     return folder
 
@@ -129,8 +130,8 @@ def export_vtk(run: Run, folder: Path) -> Path:
     from pdipc.output.vtkhdf import cells
 
     drawn = cells(run.topology)
-    elements = [(kind, vertices) for kind, vertices, _ in drawn]
-    bodies = [body for _, _, body in drawn]
+    elements: list = [(kind, vertices) for kind, vertices, _ in drawn]
+    bodies: list = [body for _, _, body in drawn]
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">', "<Collection>"]
     for frame in range(run.frame_count):
         name = f"frame_{frame:06d}.vtu"

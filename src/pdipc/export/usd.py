@@ -12,9 +12,11 @@ from scipy.spatial import cKDTree
 
 from pdipc.output.results import Run, RunError
 from pdipc.pictures.render import OBSTACLE, PALETTE, SHARP_EDGE
+from pdipc.scene.files.foreign import usd_meshes, usd_start
 from pdipc.scene.meshes import USD_SUFFIXES, split_prim
 from pdipc.scene.motion import rotation_matrix
 
+WRITTEN = (".usd", ".usda", ".usdc")
 WHOLE = 1e-6  # rates and time codes that are nearer than this part to a whole number, or to a rate of film and television, are meant to be it
 SAME_PLACE = 1e-5  # of a body's size: a point of the stage and a vertex that are no further apart are the same
 NEIGHBOURS = 12  # tets near a point among which the one that it is in is looked for
@@ -192,8 +194,8 @@ def _vectors(values: np.ndarray):
 
 
 def _usd_name(path: Path) -> None:
-    if path.suffix.lower() not in USD_SUFFIXES:
-        raise ValueError(f'"{path}": a USD file ends in one of: {", ".join(USD_SUFFIXES)}')
+    if path.suffix.lower() not in WRITTEN:
+        raise ValueError(f'"{path}": a USD file that is written ends in one of: {", ".join(WRITTEN)}')
 
 
 def _identifier(name: str, body: int) -> str:
@@ -242,7 +244,7 @@ def export_stage(run: Run, path: Path) -> Path:
     if UsdGeom.StageHasAuthoredMetersPerUnit(original):
         UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.GetStageMetersPerUnit(original))
     rate = original.GetTimeCodesPerSecond()
-    codes = time_codes(run, rate, original.GetStartTimeCode())
+    codes = time_codes(run, rate, begin := usd_start(original))
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(original.GetFramesPerSecond())
     stage.SetStartTimeCode(codes[0])
@@ -250,11 +252,14 @@ def export_stage(run: Run, path: Path) -> Path:
     if original.HasDefaultPrim():
         stage.SetDefaultPrim(stage.GetPrimAtPath(original.GetDefaultPrim().GetPath()))
     start = run.positions(0)
-    prims = [each for body, table, below in bodies for each in _prims_of(stage, original, run, start, body, table, below)]
+    prims = [
+        each for body, table, below in bodies for each in _prims_of(stage, original, run, start, body, table, below, begin)
+    ]
     for frame, code in enumerate(codes):
         positions, (before, after, seconds) = run.positions(frame), motion(run, frame)
+        last = min(max(1, frame), len(codes) - 1)
         for prim in prims:
-            prim.write(positions, (after - before) / seconds, code)
+            prim.write(positions, code, [(before, codes[max(0, last - 1)]), (after, codes[last])], seconds)
     layer.Save()
     return path
 
@@ -262,28 +267,39 @@ def export_stage(run: Run, path: Path) -> Path:
 class _Prim:
     """A mesh prim of the stage, and which vertices of the run its points are. points (p, 4) and weights (p, 4): of each point."""
 
-    def __init__(self, stage, prim, points: np.ndarray, weights: np.ndarray):
+    def __init__(self, stage, prim, begin: float, points: np.ndarray, weights: np.ndarray):
         from pxr import UsdGeom
 
         self.mesh, self.points, self.weights = UsdGeom.PointBased(prim), points, weights
         self.unit = UsdGeom.GetStageMetersPerUnit(stage) if UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1.0
         self.upright = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
-        self.shading = _authored_shading(prim)
+        self.shading = _authored_shading(prim, begin)
+        # by the prim's own orientation, as its faces are; a mirror turns faces and normals alike
+        self.outward = -1.0 if UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded else 1.0
 
-    def write(self, positions: np.ndarray, speeds: np.ndarray, code: float) -> None:
-        from pxr import Usd, UsdGeom
+    def write(self, positions: np.ndarray, code: float, ends: list[tuple[np.ndarray, float]], seconds: float) -> None:
+        """ends: positions (n, 3), m, and time codes of the two ends of a motion, which takes so many seconds: what velocities are made of. They
+        are those of points within the prim, which may move itself.
+        """
+        from pxr import Usd
 
         time = Usd.TimeCode(code)
-        matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(self.mesh.GetPrim()))  # for rows: p' = p M
-        inverse = np.linalg.inv(matrix[:3, :3])
-        local = (self._to_stage(positions) - matrix[3, :3]) @ inverse
+        local = self._local(positions, code)
+        before, after = (self._local(*end) for end in ends)
         self.mesh.GetPointsAttr().Set(_vectors(local), time)
-        self.mesh.CreateVelocitiesAttr().Set(_vectors(self._to_stage(speeds) @ inverse), time)
+        self.mesh.CreateVelocitiesAttr().Set(_vectors((after - before) / seconds), time)
         self.mesh.CreateExtentAttr().Set(_vectors(np.array([local.min(axis=0), local.max(axis=0)])), time)
         if self.shading is not None:
-            attribute, shading = self.shading
-            normals = shading.normals(local)
-            attribute.Set(_vectors(normals if shading.groups is shading.corners else normals[shading.groups]), time)
+            attribute, shading, rows = self.shading
+            normals = shading.normals(local) * self.outward
+            attribute.Set(_vectors(normals if rows is None else normals[rows]), time)
+
+    def _local(self, positions: np.ndarray, code: float) -> np.ndarray:
+        """(p, 3) in the prim's own coordinates at a time."""
+        from pxr import Usd, UsdGeom
+
+        matrix = np.array(UsdGeom.XformCache(Usd.TimeCode(code)).GetLocalToWorldTransform(self.mesh.GetPrim()))  # p' = p M
+        return (self._to_stage(positions) - matrix[3, :3]) @ np.linalg.inv(matrix[:3, :3])
 
     def _to_stage(self, values: np.ndarray) -> np.ndarray:
         """(p, 3) in the stage's unit and axes, of values at the run's vertices."""
@@ -291,75 +307,91 @@ class _Prim:
         return bound if self.upright else np.column_stack([bound[:, 0], -bound[:, 2], bound[:, 1]])
 
 
-def _authored_shading(prim) -> "tuple[Any, Shading] | None":
-    """The attribute that has a mesh's normals and which corners share one; None where it has none. Other than by corner or vertex, they
-    are blocked: they would be wrong.
+def _authored_shading(prim, begin: float) -> "tuple[Any, Shading, np.ndarray | None] | None":
+    """The attribute that has a mesh's normals, which corners share one, and of which group each of its values is (None: one of each, in
+    order); None where it has none. Normals of another kind than by corner, vertex or face are blocked: they would be wrong.
     """
     from pxr import Usd, UsdGeom
 
-    mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
+    mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode(begin)
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     if primvar and primvar.HasValue():
         attribute, how, values = primvar.GetAttr(), primvar.GetInterpolation(), np.array(primvar.ComputeFlattened(first))
-        indexed = primvar.IsIndexed()
+        if primvar.IsIndexed():  # faces that shared a normal may not for long
+            primvar.BlockIndices()
     else:
-        attribute, how, indexed = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation(), False
+        attribute, how = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation()
         values = np.array(attribute.Get(first)) if attribute and attribute.HasValue() else None
     if values is None or not prim.IsA(UsdGeom.Mesh):
         return None
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(first), dtype=np.int64)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(first), dtype=np.int64)
-    if how in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and not indexed:
-        return attribute, Shading(corners, counts, corners)
-    if how != UsdGeom.Tokens.faceVarying or indexed or len(values) != len(corners):
+    if how in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        return attribute, Shading(corners, counts, corners), None
+    if how == UsdGeom.Tokens.uniform:
+        return attribute, Shading(corners, counts, np.repeat(np.arange(len(counts)), counts)), None
+    if how != UsdGeom.Tokens.faceVarying or len(values) != len(corners):
         attribute.Block()
         return None
     groups, count = np.full(len(corners), -1), 0
     order = np.argsort(corners, kind="stable")
     for own in np.split(order, np.flatnonzero(np.diff(corners[order])) + 1):
         alike = values[own] @ values[own].T > SAME_NORMAL
-        label = connected_components(scipy.sparse.csr_array(alike), directed=False)[1]
+        label = connected_components(scipy.sparse.csr_matrix(alike.astype(np.int8)), directed=False)[1]
         groups[own], count = count + label, count + label.max() + 1
-    return attribute, Shading(corners, counts, groups)
+    return attribute, Shading(corners, counts, groups), groups
 
 
-def _prims_of(stage, original, run: Run, start: np.ndarray, body: int, table: dict[str, Any], below: str | None) -> list[_Prim]:
-    """The mesh prims that a body was read from, each bound to the body's vertices."""
+def _prims_of(
+    stage, original, run: Run, start: np.ndarray, body: int, table: dict[str, Any], below: str | None, begin: float
+) -> list[_Prim]:
+    """The mesh prims that a body was read from at the time code `begin`, each bound to the body's vertices. What is in an instance is made none in the
+    layer, since it has points of its own now.
+    """
     from pxr import Usd, UsdGeom
 
-    root = stage.GetPseudoRoot() if below is None else stage.GetPrimAtPath(below)
-    first, prims = Usd.TimeCode.EarliestTime(), []
+    first, prims = Usd.TimeCode(begin), []
     scale = np.broadcast_to(table.get("scale", 1.0), 3)
     place = rotation_matrix(table.get("rotation", (0.0, 0.0, 0.0))) * scale
     own = np.flatnonzero(run.topology["body_of_vertex"] == body)
     tets = run.tets[run.topology["body_of_vertex"][run.tets[:, 0]] == body] if len(run.tets) else run.tets
     size = float(np.linalg.norm(np.ptp(start[own], axis=0)))
-    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
-        if prim.GetTypeName() not in ("Mesh", "TetMesh") or not prim.GetAttribute("points").Get(first):
-            continue
-        if prim.IsInstanceProxy():
-            raise RunError(f"{prim.GetPath()} is in an instance, which cannot be given points of its own; make it no instance")
+    for path in [prim.GetPath() for prim in _own_meshes(stage, below, first)]:
+        while (prim := stage.GetPrimAtPath(path)).IsInstanceProxy():
+            _outermost_instance(prim).SetInstanceable(False)
         matrix = np.array(UsdGeom.XformCache(first).GetLocalToWorldTransform(prim))
         points = np.array(prim.GetAttribute("points").Get(first), dtype=np.float64) @ matrix[:3, :3] + matrix[3, :3]
         unit = UsdGeom.GetStageMetersPerUnit(original) if UsdGeom.StageHasAuthoredMetersPerUnit(original) else 1.0
         upright = UsdGeom.GetStageUpAxis(original) == UsdGeom.Tokens.y
         points = points * unit if upright else points[:, [0, 2, 1]] * [unit, unit, -unit]
         points = points @ place.T + table.get("translation", (0.0, 0.0, 0.0))
-        prims.append(_Prim(original, prim, *_bind(points, start, own, tets, size, prim, table["name"])))
+        prims.append(_Prim(original, prim, begin, *_bind(points, start, own, tets, size, prim, table["name"])))
     return prims
+
+
+def _own_meshes(stage, below: str | None, first) -> list:
+    return usd_meshes(stage.GetPseudoRoot() if below is None else stage.GetPrimAtPath(below), first)[0]
+
+
+def _outermost_instance(prim):
+    while not prim.IsInstance() or prim.IsInstanceProxy():
+        prim = prim.GetParent()
+    return prim
 
 
 def _bind(
     points: np.ndarray, start: np.ndarray, own: np.ndarray, tets: np.ndarray, size: float, prim: Any, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (p, 4) and weights (p, 4) of points: the vertex at their place, else where they are in the tets."""
+    from pxr import Usd
+
     distance, nearest = cKDTree(start[own]).query(points)
     vertices, weights = np.repeat(own[nearest][:, None], 4, axis=1), np.zeros((len(points), 4))
     weights[:, 0] = 1.0
     loose = np.flatnonzero(distance > SAME_PLACE * size)
     if not len(loose):
         return vertices, weights
-    used = prim.GetAttribute("faceVertexIndices").Get()
+    used = prim.GetAttribute("faceVertexIndices").Get(Usd.TimeCode.EarliestTime())
     if not len(tets):
         loose = np.intersect1d(loose, np.array(used)) if used else loose  # a point of no face was left out of the simulation
         if len(loose):

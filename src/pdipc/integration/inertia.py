@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.device import system
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.integration import status
 
@@ -20,7 +21,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def compare(
         first: int,
         x_start: wp.array(dtype=vec3),
@@ -33,7 +34,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if x_start[i][axis] != x[i][axis]:
                 foreign_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def predict(
         first: int,
         x: wp.array(dtype=vec3),
@@ -68,7 +69,7 @@ def kernels(real: Real) -> SimpleNamespace:
             z_out[i] = target[i] - x[i]
             u_tilde_out[i] = target[i] - x[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -85,7 +86,7 @@ def kernels(real: Real) -> SimpleNamespace:
         linear[0] = 0
         going_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def finish(
         first: int,
         x_start: wp.array(dtype=vec3),
@@ -111,7 +112,7 @@ def kernels(real: Real) -> SimpleNamespace:
             left = vec3()
         rest_out[i] = left
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def report(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -140,7 +141,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     milliseconds = system.milliseconds()  # the step is one graph, so its stages are timed where it runs
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def start_clock(first: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         for i in range(clock.shape[0]):
             clock[i] = wp.float64(0.0)
@@ -148,7 +149,7 @@ def kernels(real: Real) -> SimpleNamespace:
         clock[status.STARTED] = now
         clock[status.LAST] = now
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def mark(first: int, stage: int, call: wp.uint64, argument: wp.int64, clock: wp.array(dtype=wp.float64)):
         """The time since the last mark belongs to `stage`."""
         now = milliseconds(call, argument)

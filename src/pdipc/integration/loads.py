@@ -20,6 +20,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.scene.assembly import AssembledForce, AssembledWind, Assembly
@@ -109,7 +110,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def drag(
         first: int,
         time: wp.float64,
@@ -139,7 +140,7 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[t] = force
         rate_out[t] = rate
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         starts: wp.array(dtype=wp.int32),

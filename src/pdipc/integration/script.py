@@ -32,6 +32,7 @@ import warp as wp
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -52,7 +53,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     zero = wp.constant(scalar(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         at_out: wp.array(dtype=wp.int32),
@@ -68,7 +69,7 @@ def kernels(real: Real) -> SimpleNamespace:
         drive_out[m] = 1
         crowded_out[m] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def aim(
         first: int,
         members: wp.array(dtype=wp.int32),
@@ -112,11 +113,11 @@ def kernels(real: Real) -> SimpleNamespace:
                 x = turns[slot] * (points[k] - center[m]) + places[slot]
                 target_out[i] = vec3(scalar(x[0]), scalar(x[1]), scalar(x[2]))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, behind_out: wp.array(dtype=wp.int32)):
         behind_out[first + wp.tid()] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def compare(
         first: int,
         members: wp.array(dtype=wp.int32),
@@ -131,13 +132,13 @@ def kernels(real: Real) -> SimpleNamespace:
         if wp.length_sq((target[i] - base[i]) - u[i]) > zero:
             behind_out[mover[i]] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hold(first: int, crowded: wp.array(dtype=wp.int32), drive_out: wp.array(dtype=wp.int32)):
         m = first + wp.tid()
         if crowded[m] != 0:
             drive_out[m] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def advance(
         first: int,
         movers: int,
@@ -245,7 +246,8 @@ class Reached:
         caught = {
             name.removeprefix("caught_"): np.array(values) for name, values in arrays.items() if name.startswith("caught_")
         }
-        return cls(*(np.array(arrays[f"reached_{name}"]) for name in ("times", "poses", "anchors")), caught)
+        times, poses, anchors = (np.array(arrays[f"reached_{name}"]) for name in ("times", "poses", "anchors"))
+        return cls(times, poses, anchors, caught)
 
     def pose(self, mover: Mover) -> tuple[Rotation, np.ndarray]:
         """Turn from the start, and place of the origin, (3,) m."""
@@ -388,7 +390,7 @@ class Script:
             lead, path = self.leads.get(mover.key), mover.trajectory
             if lead is not None:
                 way = self._led(mover, lead, reached, positions)
-            elif mover.rigid and reached.times[mover.body] < time:
+            elif mover.body >= 0 and isinstance(path, Trajectory) and reached.times[mover.body] < time:
                 start = returned(mover, path, float(reached.times[mover.body]), time, self.h)
                 last = min(end, start + CATCH_UP * self.h)
                 way = Way(path, start, _waypoints([(mover, path)], start, last))
@@ -442,7 +444,7 @@ class Script:
             own = slice(offsets[number], offsets[number] + counts[number])
             if way.path is None:
                 continue
-            if way.path.is_rigid:
+            if not isinstance(way.path, Deforming):
                 self._where[mover.vertices] = way.path.apply(mover.points, way.times[-1])
                 if counts[number] > 1:
                     straight[number], centers[number] = 0, way.path.center
@@ -562,10 +564,10 @@ def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: floa
     low = np.flatnonzero((far[1:] <= far[:-1]) & (far[1:] <= np.append(far[2:], np.inf))) + 1
     for k in low[::-1]:
         a, b = times[k - 1], times[min(k + 1, len(times) - 1)]
-        nearest = float(minimize_scalar(away, bounds=(a, b), method="bounded", options={"xatol": 1e-9 * h}).x)
-        for time in (times[k], nearest):
+        nearest = float(minimize_scalar(away, bounds=(float(a), float(b)), method="bounded", options={"xatol": 1e-9 * h}).x)
+        for time in (float(times[k]), nearest):
             if away(time) <= mover.deviation:
-                return float(time)
+                return time
     return stopped
 
 

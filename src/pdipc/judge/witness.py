@@ -55,7 +55,7 @@ class Watch:
         self.sides = edges, owner, first = _edges(self.triangles)
         self.fixed = np.zeros(len(self.triangles), dtype=bool)
         if obstacle is not None:
-            self.fixed = np.asarray(obstacle)[self.triangles].all(axis=1)
+            self.fixed = np.asarray(np.asarray(obstacle)[self.triangles].all(axis=1))
         self.fixed_edge = np.logical_and.reduceat(self.fixed[owner], first[:-1]) if len(edges) else np.zeros(0, dtype=bool)
         self.start: np.ndarray | None = None
 

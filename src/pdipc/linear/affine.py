@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -83,7 +84,7 @@ def kernels(real: Real) -> SimpleNamespace:
     vec3, vec4, mat33 = real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def expand(
         first: int,
         vertices: wp.array(dtype=wp.int32),
@@ -99,7 +100,7 @@ def kernels(real: Real) -> SimpleNamespace:
         origin = u[q[0]]
         u[vertices[i]] = origin + w[1] * (u[q[1]] - origin) + w[2] * (u[q[2]] - origin) + w[3] * (u[q[3]] - origin)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_up(
         first: int,
         begins: wp.array(dtype=wp.int32),
@@ -128,7 +129,7 @@ def kernels(real: Real) -> SimpleNamespace:
         sums_out[4 * c + 2] = s2
         sums_out[4 * c + 3] = s3
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hand_over(
         first: int,
         body_ends: wp.array(dtype=wp.int32),
@@ -144,7 +145,7 @@ def kernels(real: Real) -> SimpleNamespace:
         h = handles[b][i % 4]
         r[h] = r[h] + total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_up_blocks(
         first: int,
         begins: wp.array(dtype=wp.int32),
@@ -178,7 +179,7 @@ def kernels(real: Real) -> SimpleNamespace:
         sums_out[4 * c + 2] = s2
         sums_out[4 * c + 3] = s3
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def hand_over_blocks(
         first: int,
         body_ends: wp.array(dtype=wp.int32),

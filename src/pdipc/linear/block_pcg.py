@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import Kernel, func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
@@ -30,6 +31,8 @@ class Coupling(Protocol):
     diagonal: wp.array | None  # (n,) 3x3 blocks of the diagonal, kg/s^2; None where the preconditioner does without
 
     rows: ContactRows | None  # where the Hessian is assembled; None where a product is made by `apply`
+
+    capacity: int  # pairs that there is room for; 0 where there is no `operand`
 
     def assemble(self) -> Any:
         """Launches the blocks of `rows` as the Hessian is now; returns what a product works on."""
@@ -195,7 +198,7 @@ class BlockPcg:
         self.sums.launch(self._kernels.correct, inputs)
 
 
-def _advance_kernel(real: Real) -> wp.Kernel:
+def _advance_kernel(real: Real) -> Kernel:
     from pdipc.linear import coarse
 
     return coarse.kernels(real).advance
@@ -209,7 +212,7 @@ def kernels(real: Real) -> SimpleNamespace:
     vec6 = wp.types.vector(6, wp.float64)
     Rows, contact = row_kernels(real).Rows, row_kernels(real).product
 
-    @wp.func
+    @func
     def product(
         i: int,
         offsets: wp.array(dtype=wp.int32),
@@ -224,11 +227,11 @@ def kernels(real: Real) -> SimpleNamespace:
             total += values[e] * (p[columns[e]] - own)
         return total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, values_out: wp.array(dtype=vec3)):
         values_out[first + wp.tid()] = vec3()
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def invert_diagonal(
         first: int,
         free: wp.array(dtype=wp.int32),
@@ -249,7 +252,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += contact_c[i]
             inverse_out[i] = f.invert(total)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def start(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -277,7 +280,7 @@ def kernels(real: Real) -> SimpleNamespace:
         s_out[i] = vec3()
         p_out[i] = vec3()
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def move_rigidly(
         first: int,
         unknown: wp.array(dtype=wp.int32),
@@ -290,7 +293,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if unknown[i] == 1:
             p[i] = p[i] + (u[i] - inverse[i] * r[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         partial: wp.array(dtype=scalar),
@@ -331,7 +334,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if gamma < scalar(0.0):
                 indefinite_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_alpha(
         first: int,
         partial: wp.array(dtype=scalar),
@@ -353,13 +356,13 @@ def kernels(real: Real) -> SimpleNamespace:
                 left[0] = 1
                 indefinite_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def judge_preconditioner(first: int, numbers: wp.array(dtype=scalar), indefinite_out: wp.array(dtype=wp.int32)):
         """A negative r . M^-1 r, which also ends the solve, tells of a preconditioner that is indefinite, as the matrix then is."""
         if numbers[pcg.GAMMA] < scalar(0.0):
             indefinite_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def multiply(
         first: int,
         share: int,
@@ -386,7 +389,7 @@ def kernels(real: Real) -> SimpleNamespace:
             delta += wp.dot(u[i], total)
         f.store_sum(delta, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def correct(
         first: int,
         share: int,

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -132,7 +133,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, mat33 = real.scalar, real.mat33
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         begins: wp.array(dtype=wp.int32),
@@ -163,7 +164,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if mirrors[e] >= 0:
             values_out[mirrors[e]] = wp.transpose(total)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather_diagonal(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -180,7 +181,7 @@ def kernels(real: Real) -> SimpleNamespace:
         total[2, 2] = total[2, 2] + held[i]
         diagonal_out[i] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrain(
         first: int,
         body: wp.array(dtype=wp.int32),

@@ -17,6 +17,8 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse import csgraph
 
+from pdipc.device import language
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition, pcg
@@ -152,7 +154,7 @@ def kernels(real: Real) -> SimpleNamespace:
     advance_vertices = pcg.functions(real).advance
     alpha_slot, beta_slot = pcg.ALPHA, pcg.BETA
 
-    @wp.func_native(_FACTORIZE)
+    @language.func_native(_FACTORIZE)
     def factorize_rows(
         count: int,
         starts: wp.array(dtype=wp.int32),
@@ -161,12 +163,12 @@ def kernels(real: Real) -> SimpleNamespace:
         factor_out: wp.array(dtype=wp.float64),
     ): ...
 
-    @wp.func_native(_SOLVE)
+    @language.func_native(_SOLVE)
     def solve_rows(
         count: int, starts: wp.array(dtype=wp.int32), factor: wp.array(dtype=wp.float64), z: wp.array(dtype=wp.vec4d)
     ): ...
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def add_contacts(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -185,7 +187,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 total += wp.float64(wp.trace(contact_block[members[k]]))
         added_out[g] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def factorize(
         first: int,
         count: int,
@@ -196,7 +198,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         factorize_rows(count, starts, entries, added, factor_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def solve(
         first: int,
         count: int,
@@ -207,7 +209,7 @@ def kernels(real: Real) -> SimpleNamespace:
         """z = C^-1 z."""
         solve_rows(count, starts, factor, z)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrict(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -222,7 +224,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += r[members[k]]
         z_out[g] = wp.vec4d(wp.float64(total[0]), wp.float64(total[1]), wp.float64(total[2]), wp.float64(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def advance(
         first: int,
         share: int,
@@ -244,7 +246,7 @@ def kernels(real: Real) -> SimpleNamespace:
             for i in range(low, high):
                 w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def correct(
         first: int,
         share: int,

@@ -11,13 +11,14 @@ from typing import Any
 
 import warp as wp
 
+from pdipc.device.language import Kernel, func, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
 PARTNERS = 3  # of a vertex in a pair
 
 
-@wp.func
+@func
 def first_entry(v: int, ends: wp.array(dtype=wp.int32)) -> int:
     """Where the list of vertex v begins."""
     low = int(0)
@@ -36,7 +37,7 @@ class ContactRows:
         self.columns = wp.zeros(places, dtype=wp.int32, device=device.warp)
         self.values = wp.zeros(places, dtype=real.mat33, device=device.warp)
 
-    def assemble(self, kernel: wp.Kernel, operand: Any, free: wp.array, ends: wp.array, entries: wp.array) -> Any:
+    def assemble(self, kernel: Kernel, operand: Any, free: wp.array, ends: wp.array, entries: wp.array) -> Any:
         """Launches the blocks, and returns what a product works on. kernel: of `assembly`, for `operand`; free: (n,) scalar, zero where nothing
         is unknown; ends: (n,) int32, where the list of each vertex's pairs ends; entries: these lists, four times a pair plus a vertex's place in it.
         """
@@ -58,15 +59,17 @@ def nothing(real: Real) -> Any:
 def kernels(real: Real) -> SimpleNamespace:
     vec3, mat33 = real.vec3, real.mat33
 
-    @wp.struct
-    class Rows:
-        used: int
-        ends: wp.array(dtype=wp.int32)
-        lengths: wp.array(dtype=wp.int32)
-        columns: wp.array(dtype=wp.int32)
-        values: wp.array(dtype=mat33)
+    Rows = struct_of(
+        "Rows",
+        __name__,
+        used=int,
+        ends=wp.array(dtype=wp.int32),
+        lengths=wp.array(dtype=wp.int32),
+        columns=wp.array(dtype=wp.int32),
+        values=wp.array(dtype=mat33),
+    )
 
-    @wp.func
+    @func
     def product(i: int, rows: Rows, p: wp.array(dtype=vec3)) -> vec3:
         """Row i of (contact Hessian) p."""
         total = vec3()
@@ -80,13 +83,13 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(Rows=Rows, product=product)
 
 
-def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> wp.Kernel:
+def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> Kernel:
     """The kernel that fills the rows. block_of(o, k, s, t): the block of pair k between its vertices s and t; operand: the type of o, which
     has `quads`, and `ends` as above.
     """
     scalar, mat33 = real.scalar, real.mat33
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def assemble(
         first: int,
         o: operand,
@@ -119,4 +122,4 @@ def assembly(real: Real, module: wp.Module, operand: Any, block_of: Any) -> wp.K
                             values_out[at + slot] = values_out[at + slot] + block_of(o, k, s, t)
         lengths_out[v] = length
 
-    return assemble  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return assemble

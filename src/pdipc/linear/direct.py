@@ -4,7 +4,11 @@ Contacts change K from solve to solve. Then the factorization of A preconditions
 iterations is the rank of what contacts add, at most, and in practice a few dozen.
 """
 
+import importlib
+from typing import Any
+
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import warp as wp
 
@@ -21,7 +25,7 @@ class Direct(Solver):
     def __init__(self, system: System, tolerance: float, max_iterations: int):
         super().__init__(system, tolerance, max_iterations)
         self._free = np.flatnonzero(system.free)
-        self._matrix = system.matrix[self._free][:, self._free].tocsc()
+        self._matrix = sp.csc_matrix(system.matrix[self._free][:, self._free])
         self._fixed = system.matrix[self._free][:, np.flatnonzero(~system.free)].tocsr()
         self._inverse = factorize(self._matrix) if self._free.size else np.copy
         self._p, self._y = self.zeros(self.real.vec3), self.zeros(self.real.vec3)
@@ -91,10 +95,10 @@ class Direct(Solver):
         return blocks
 
 
-def factorize(matrix: spla.LinearOperator):
+def factorize(matrix: sp.csc_matrix):
     """A function that applies the inverse of a symmetric positive definite matrix to the columns of an array."""
     try:
-        import cholespy
+        cholespy: Any = importlib.import_module("cholespy")
     except ImportError:
         options = {"SymmetricMode": True}
         return spla.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve

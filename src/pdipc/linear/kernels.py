@@ -15,7 +15,8 @@ from typing import Any
 
 import warp as wp
 
-from pdipc.device import blocks
+from pdipc.device import blocks, language
+from pdipc.device.language import Kernel, func, kernel
 from pdipc.device.launch import BLOCK, Device
 from pdipc.device.precision import Real
 from pdipc.linear import rows
@@ -44,15 +45,15 @@ class Sums:
         self.device, self.count = device, count
         self.slots = max(1, -(-count // BLOCK))
 
-    def launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+    def launch(self, kernel: Kernel, inputs: list[Any]) -> None:
         """Runs `kernel(first, share, count, *inputs)` over all vertices."""
         self.device.launch_blocks(kernel, self.slots, [1 if self.device.wide else BLOCK, self.count, *inputs])
 
-    def launch_groups(self, kernel: wp.Kernel, groups: int, inputs: list[Any], grain: int = BLOCK) -> None:
+    def launch_groups(self, kernel: Kernel, groups: int, inputs: list[Any], grain: int = BLOCK) -> None:
         """Runs `kernel(first, *inputs)` with one thread for each group of vertices on the CPU, one block of threads on CUDA."""
         self.device.launch_blocks(kernel, groups, inputs, grain)
 
-    def conclude(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+    def conclude(self, kernel: Kernel, inputs: list[Any]) -> None:
         """Runs `kernel(first, *inputs)` in one thread on the CPU and in one block of threads on CUDA."""
         if self.device.wide:
             self.device.launch_blocks(kernel, 1, inputs)
@@ -68,7 +69,7 @@ def functions(real: Real) -> SimpleNamespace:
     hidden_part = HIDDEN * real.unit_roundoff
     block_total = blocks.total(scalar)
 
-    @wp.func
+    @func
     def precondition(i: int, inverse: wp.array(dtype=scalar), inverse_block: wp.array(dtype=mat33), r: vec3):
         """D_i^-1 r; a negative `inverse` says that D_i is a full 3x3 block."""
         factor = inverse[i]
@@ -76,7 +77,7 @@ def functions(real: Real) -> SimpleNamespace:
             return inverse_block[i] * r
         return factor * r
 
-    @wp.func
+    @func
     def invert(a: mat33):
         """a^-1 of a symmetric, positive semidefinite block, by its L D L^T.
 
@@ -96,22 +97,22 @@ def functions(real: Real) -> SimpleNamespace:
         r2 = vec3(l10 * l21 - l20, -l21, scalar(1.0))
         return wp.outer(r0, r0) / d0 + wp.outer(r1, r1) / d1 + wp.outer(r2, r2) / d2
 
-    @wp.func
+    @func
     def store_sum(total: scalar, worker: int, partial_out: wp.array(dtype=scalar)):
         """Adds `total` up over the block of threads and stores it in the block's slot."""
         all_of_block = block_total(total)
         if worker % wp.block_dim() == 0:
             partial_out[worker // wp.block_dim()] = all_of_block
 
-    @wp.func_native(_SUM_SLOTS.replace("SCALAR", f"wp::{real.name}"))
+    @language.func_native(_SUM_SLOTS.replace("SCALAR", f"wp::{real.name}"))
     def sum_slots(partial: wp.array(dtype=scalar), count: int, lane: int, step: int) -> scalar: ...
 
-    @wp.func
+    @func
     def sum_partials(partial: wp.array(dtype=scalar), count: int, lane: int):
         """Sum of `count` numbers, by one thread or one block of threads; every thread gets it."""
         return block_total(sum_slots(partial, count, lane, wp.block_dim()))
 
-    @wp.func
+    @func
     def begin_status(
         gamma: scalar,
         reference: wp.array(dtype=scalar),
@@ -138,7 +139,7 @@ def functions(real: Real) -> SimpleNamespace:
             condition_out[0] = 1
         residual_out[0] = residual
 
-    @wp.func
+    @func
     def update_status(
         gamma: scalar,
         done: int,
@@ -167,16 +168,16 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     invert = functions(real).invert
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, values_out: wp.array(dtype=vec3)):
         values_out[first + wp.tid()] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def copy(first: int, values: wp.array(dtype=vec3), values_out: wp.array(dtype=vec3)):
         i = first + wp.tid()
         values_out[i] = values[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def invert_diagonal(
         first: int,
         diagonal: wp.array(dtype=scalar),

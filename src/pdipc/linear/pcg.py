@@ -14,6 +14,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device import language
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
@@ -105,7 +107,7 @@ def functions(real: Real) -> SimpleNamespace:
     """The step of all vectors that needs no preconditioner, for the vertices low to high - 1."""
     scalar, vec3 = real.scalar, real.vec3
 
-    @wp.func_native(_ADVANCE.replace("SCALAR", f"wp::{real.name}"))
+    @language.func_native(_ADVANCE.replace("SCALAR", f"wp::{real.name}"))
     def advance(
         low: int,
         high: int,
@@ -130,7 +132,7 @@ def kernels(real: Real) -> SimpleNamespace:
     f = shared.functions(real)
     advance = functions(real).advance
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def start(
         first: int,
         share: int,
@@ -170,7 +172,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 w[i] = zero
         f.store_sum(gamma, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def multiply(
         first: int,
         share: int,
@@ -196,7 +198,7 @@ def kernels(real: Real) -> SimpleNamespace:
             delta += wp.dot(own, product)
         f.store_sum(delta, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def update(
         first: int,
         share: int,
@@ -228,7 +230,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         f.store_sum(gamma, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         partial: wp.array(dtype=scalar),
@@ -251,7 +253,7 @@ def kernels(real: Real) -> SimpleNamespace:
             numbers[GAMMA] = gamma
             f.begin_status(gamma, reference, tolerance, max_iterations, first_out, left_out, residual_out, condition_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_alpha(
         first: int,
         partial: wp.array(dtype=scalar),
@@ -271,7 +273,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 numbers[ALPHA] = scalar(0.0)
                 left[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_beta(
         first: int,
         partial: wp.array(dtype=scalar),

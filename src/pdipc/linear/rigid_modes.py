@@ -20,6 +20,8 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse import csgraph
 
+from pdipc.device import language
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import partition
@@ -164,7 +166,7 @@ def functions(real: Real) -> SimpleNamespace:
     wide, wide33 = wp.float64, wp.mat33d
     vec6 = wp.types.vector(MODES, wide)
 
-    @wp.func
+    @func
     def widened(a: mat33) -> wide33:
         return wide33(
             wide(a[0, 0]), wide(a[0, 1]), wide(a[0, 2]),
@@ -172,7 +174,7 @@ def functions(real: Real) -> SimpleNamespace:
             wide(a[2, 0]), wide(a[2, 1]), wide(a[2, 2]),
         )  # fmt: skip
 
-    @wp.func
+    @func
     def skew(a: vec3) -> wide33:
         zero = wide(0.0)
         x = wide(a[0])
@@ -180,7 +182,7 @@ def functions(real: Real) -> SimpleNamespace:
         z = wide(a[2])
         return wide33(zero, -z, y, z, zero, -x, -y, x, zero)
 
-    @wp.func
+    @func
     def mode(arm: vec3, direction: vec3) -> vec6:
         """Z_i^T direction: what a force along it does to the six motions."""
         a = wp.vec3d(wp.float64(arm[0]), wp.float64(arm[1]), wp.float64(arm[2]))
@@ -188,7 +190,7 @@ def functions(real: Real) -> SimpleNamespace:
         t = wp.cross(a, d)
         return vec6(d[0], d[1], d[2], t[0], t[1], t[2])
 
-    @wp.func
+    @func
     def add_outer(c: wp.array(dtype=wp.float64), size: int, g: int, h: int, scale: wp.float64, a: vec6, b: vec6):
         """C_gh += scale a b^T."""
         for i in range(MODES):
@@ -208,12 +210,12 @@ def kernels(real: Real) -> SimpleNamespace:
     vec6 = f.vec6
     wide, wide33 = wp.float64, wp.mat33d
 
-    @wp.func_native(_FACTORIZE.replace("LOST", repr(LOST)))
+    @language.func_native(_FACTORIZE.replace("LOST", repr(LOST)))
     def factorize_rows(
         groups: int, low_of: wp.array(dtype=wp.int32), c: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64)
     ): ...
 
-    @wp.func_native(_SOLVE)
+    @language.func_native(_SOLVE)
     def solve_rows(
         groups: int,
         low_of: wp.array(dtype=wp.int32),
@@ -222,7 +224,7 @@ def kernels(real: Real) -> SimpleNamespace:
         z: wp.array(dtype=vec6),
     ): ...
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def center(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -246,7 +248,7 @@ def kernels(real: Real) -> SimpleNamespace:
             for k in range(starts[g], starts[g + 1]):
                 arms_out[members[k]] = scale * arms_out[members[k]]
 
-    @wp.func
+    @func
     def add_block(c: wp.array(dtype=wide), size: int, g: int, h: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33):
         for i in range(3):
             at = (MODES * g + i) * size + MODES * h
@@ -257,7 +259,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 c[below + j] = c[below + j] + rt[i, j]
                 c[below + 3 + j] = c[below + 3 + j] + rr[i, j]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -314,13 +316,13 @@ def kernels(real: Real) -> SimpleNamespace:
                         add_block(c, size, g, h, k, -kf, lever, -(own * kf))
         add_block(c, size, g, g, tt, tr, rt, rr)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def factorize(
         first: int, groups: int, low: wp.array(dtype=wp.int32), c: wp.array(dtype=wide), inverse: wp.array(dtype=wide)
     ):
         factorize_rows(groups, low, c, inverse)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrict(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -336,7 +338,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += f.mode(arms[i], r[i])
         z_out[g] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def solve(
         first: int,
         groups: int,

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device import language
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -111,7 +112,7 @@ def functions(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     product = _ROW_PRODUCT.replace("SCALAR", f"wp::{real.name}").replace("SLICE", str(SLICE))
 
-    @wp.func_native(re.sub(r"OWN\(\d\)", "0", product))
+    @language.func_native(re.sub(r"OWN\(\d\)", "0", product))
     def row_product(
         i: int,
         offsets: wp.array(dtype=wp.int32),
@@ -120,7 +121,7 @@ def functions(real: Real) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
     ) -> vec3: ...
 
-    @wp.func_native(re.sub(r"OWN\((\d)\)", r"x.data[i].c[\1]", product))
+    @language.func_native(re.sub(r"OWN\((\d)\)", r"x.data[i].c[\1]", product))
     def row_difference(
         i: int,
         offsets: wp.array(dtype=wp.int32),

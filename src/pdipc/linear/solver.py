@@ -17,9 +17,14 @@ class Contact(Protocol):
     apply: `apply(p, y)` launches y_i += (contact Hessian p)_i; or None where `scalar` is the whole contribution.
     """
 
-    diagonal: wp.array | None
-    scalar: wp.array | None
-    apply: Callable[[wp.array, wp.array], None] | None
+    @property
+    def diagonal(self) -> wp.array | None: ...
+
+    @property
+    def scalar(self) -> wp.array | None: ...
+
+    @property
+    def apply(self) -> Callable[[wp.array, wp.array], None] | None: ...
 
 
 class Solver:

@@ -1,6 +1,7 @@
 """The constant matrix A of Eq. (3) on the device."""
 
 import functools
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,7 +25,7 @@ class System:
     Raises ValueError where the matrix is not square, not symmetric, or a free vertex has a diagonal entry that is not positive.
     """
 
-    def __init__(self, device: Device, real: Real, matrix: sp.spmatrix, free: np.ndarray):
+    def __init__(self, device: Device, real: Real, matrix: Any, free: np.ndarray):
         matrix = sp.csr_matrix(matrix, dtype=np.float64)
         matrix.sum_duplicates()
         free = np.asarray(free, dtype=bool)

@@ -17,6 +17,7 @@ import warp as wp
 from scipy.sparse import csgraph
 
 from pdipc.device import blocks
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact
@@ -64,7 +65,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     invert, of_block = shared.functions(real).invert, blocks.total(scalar)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -102,7 +103,7 @@ def kernels(real: Real) -> SimpleNamespace:
             )  # fmt: skip
             shift_out[body] = invert(c) * force
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def move(first: int, label: wp.array(dtype=wp.int32), shift: wp.array(dtype=vec3), x_out: wp.array(dtype=vec3)):
         i = first + wp.tid()
         if label[i] >= 0:

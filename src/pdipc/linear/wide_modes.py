@@ -19,6 +19,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from pdipc.device import blocks
+from pdipc.device.language import Kernel, func, kernel
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device, Span
 from pdipc.device.precision import Real
 from pdipc.linear import rigid_modes
@@ -86,7 +87,7 @@ class WideModes(RigidModes):
             device.launch(k.eliminate, MODES * groups * SHARES, [groups, SHARES, pivot, self._lead, here, there])
             here, there = there, here
 
-    def couple(self, kernel: wp.Kernel, count: wp.array, capacity: int, inputs: list) -> None:
+    def couple(self, kernel: Kernel, count: wp.array, capacity: int, inputs: list) -> None:
         """Launches a kernel of `coupling` over all pairs of groups that pairs in contact connect: `count` of them, in inputs[2]."""
         self.device.launch_list(self._wide.mark, capacity, [count, inputs[2], self.label, self.groups, self.near])
         layout = [self.starts, self.members, self.label, self.groups, self.arms, self.near]
@@ -105,7 +106,7 @@ def functions(real: Real) -> SimpleNamespace:
     vec6 = wp.types.vector(MODES, wide)
     of_block, block_sum = blocks.total(wide33), blocks.total(vec6)
 
-    @wp.func
+    @func
     def part(i: int, j: int, tt: wide33, tr: wide33, rt: wide33, rr: wide33) -> wide:
         """An entry of the 6x6 block."""
         if i < 3:
@@ -116,7 +117,7 @@ def functions(real: Real) -> SimpleNamespace:
             return rt[i - 3, j]
         return rr[i - 3, j - 3]
 
-    @wp.func
+    @func
     def add(
         lane: int,
         groups: int,
@@ -156,7 +157,7 @@ def kernels(real: Real) -> SimpleNamespace:
     total_of, total_number = blocks.total(vec3), blocks.total(scalar)
     mode = rigid_modes.functions(real).mode
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def center(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -184,7 +185,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(begin, end, wp.block_dim()):
             arms_out[members[k]] = scale * ((x[members[k]] - origin) - middle)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -265,7 +266,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             near_out[g * groups + h] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def mark(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -285,13 +286,13 @@ def kernels(real: Real) -> SimpleNamespace:
                         if h >= 0 and g >= h:
                             near_out[g * groups + h] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def lead(first: int, size: int, c: wp.array(dtype=wide), lead_out: wp.array(dtype=wide)):
         """The diagonal, to tell what a pivot was before rounding took it."""
         i = first + wp.tid()
         lead_out[i] = c[i * size + i]
 
-    @wp.func
+    @func
     def solve_pivot(pivot: int, size: int, leading: wp.array(dtype=wide), c: wp.array(dtype=wide), a: vec6) -> vec6:
         """C_kk^-1 a by L D L^T; a pivot that rounding has lost is infinite."""
         lower = mat66()
@@ -325,7 +326,7 @@ def kernels(real: Real) -> SimpleNamespace:
             w[i] = own
         return w
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def eliminate(
         first: int,
         groups: int,
@@ -358,7 +359,7 @@ def kernels(real: Real) -> SimpleNamespace:
                         total += w[k] * c[(MODES * pivot + k) * size + MODES * h + j]
                     c_out[at] = wp.where(inside, total, c[at] - total)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrict(
         first: int,
         chunk_starts: wp.array(dtype=wp.int32),
@@ -379,7 +380,7 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(center=center, gather=gather, mark=mark, lead=lead, eliminate=eliminate, restrict=restrict)
 
 
-def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type, second_type: type) -> wp.Kernel:
+def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type, second_type: type) -> Kernel:
     """A kernel that adds the Hessians of pairs to C, a block of threads a pair of groups.
 
     block_of(k, s, t, a, b): a Warp function, the 3x3 block of pair k between its vertices s and t, in double precision, from two arrays
@@ -388,7 +389,7 @@ def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type
     f, vec3 = functions(real), real.vec3
     wide, wide33 = wp.float64, wp.mat33d
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def couple_groups(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -438,4 +439,4 @@ def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type
         rr = f.of_block(rr)
         f.add(lane, groups, g, h, tt, tr, rt, rr, c)
 
-    return couple_groups  # pyright: ignore[reportReturnType]  (Warp types kernels as functions)
+    return couple_groups

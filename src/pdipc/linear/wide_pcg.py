@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.device import blocks
+from pdipc.device.language import kernel
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
@@ -51,6 +52,8 @@ class Operator(NamedTuple):
 
 class WidePcg(BlockPcg):
     """As `BlockPcg`. operators: of the two kinds of contacts that there may be, in the order of `contacts` in a solve."""
+
+    modes: WideModes
 
     def __init__(
         self,
@@ -154,13 +157,13 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
 
     row_product = block_pcg.kernels(real).product
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(first: int, going: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32), flags_out: wp.array(dtype=wp.int32)):
         flags_out[GOING] = going[0]
         flags_out[LEFT] = left[0]
         flags_out[STARTED] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def multiply(
         first: int,
         flags: wp.array(dtype=wp.int32),
@@ -209,7 +212,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
             delta_out[block] = delta
 
     # Long: all vectors in one launch an iteration, which is what this solver is for.
-    @wp.kernel(module=module)
+    @kernel(module)
     def advance(
         first: int,
         flags: wp.array(dtype=wp.int32),
@@ -316,7 +319,7 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         if lane == 0:
             sums_out[chunk] = total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def correct(
         first: int,
         flags: wp.array(dtype=wp.int32),

@@ -4,6 +4,8 @@ Round shapes are polyhedra whose vertices lie on the shape, so an obstacle is no
 `deviation` times its radius.
 """
 
+from typing import Any
+
 import numpy as np
 import trimesh
 
@@ -16,7 +18,7 @@ class Unsupported(NotImplementedError):
     """Something of a Newton model that SolverPDIPC does not simulate; the message says what, where, and what would do."""
 
 
-def triangles_of(kind: str, scale: np.ndarray, source: object, size: float, where: str) -> tuple[np.ndarray, np.ndarray]:
+def triangles_of(kind: str, scale: np.ndarray, source: Any, size: float, where: str) -> tuple[np.ndarray, np.ndarray]:
     """V (n, 3) m and F (m, 3), facing outward, of a shape in its own frame, long axes along z.
 
     kind: the name of its `newton.GeoType`. scale: (3,) its dimensions as Newton keeps them. size: m, half the edge of the square that stands

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 HERE = 1e-6  # m, and part of a turn: a body that is no further from where it was told to be is there
 LOST = 2.0  # units in the last place; sqrt(3) in fact
+KEPT = 8  # time steps that simulations are kept for; a program that chooses a new one every step would fill the memory
 AT_ONCE = 1e9  # m/s: what leads obstacles and pins arrives within the step, as far as nothing is in the way
 
 
@@ -60,7 +61,7 @@ class SolverPDIPC(SolverBase):
         self.result: StepResult | None = None
         self._tables = dict(simulation or {}), dict(contact or {})
         self._follow = follow_bodies
-        self._simulations: dict[float, Simulation] = {}  # by time step
+        self._simulations: dict[float, Simulation] = {}  # by time step, the last used last
         self._now: Simulation | None = None
         self._told = False  # of rounding
         self._translate()
@@ -118,7 +119,9 @@ class SolverPDIPC(SolverBase):
         mask = self._normalize_reset_world_mask(world_mask)
         model, wanted = self.model, newton.StateFlags
         flags = -1 if flags is None else int(flags)
-        chosen = np.ones(model.particle_count, dtype=bool) if mask is None else mask.numpy()[_read(model, "particle_world")]
+        chosen = np.ones(model.particle_count, dtype=bool)
+        if mask is not None:
+            chosen = _numpy(mask)[_read(model, "particle_world")]
         for flag, name in ((wanted.PARTICLE_Q, "particle_q"), (wanted.PARTICLE_QD, "particle_qd")):
             if flags & int(flag):
                 values = _read(state, name).copy()
@@ -133,9 +136,10 @@ class SolverPDIPC(SolverBase):
             self._start()
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
-        """Takes over gravity and friction, and shapes and their bodies where flags name them; particles go on where they are.
+        """Takes over gravity and friction, masses and materials, and shapes and their bodies where flags name any of these; particles go on where
+        they are.
 
-        Raises what the constructor does.
+        Raises what the constructor does, and goes on with what was there before.
         """
         wanted, flags = newton.ModelFlags, int(flags)
         shapes = (
@@ -143,8 +147,8 @@ class SolverPDIPC(SolverBase):
         )
         if not flags & int(shapes | wanted.MODEL_PROPERTIES):
             return
-        self._simulations, self._now = {}, None
         self._translate(self._q, self._body_q)
+        self._simulations, self._now = {}, None
 
     def rebuild_bvh(self, state: newton.State) -> None:
         """Nothing: SolverVBD has it and programs call it; what finds contacts here is kept up to date within the step."""
@@ -154,22 +158,23 @@ class SolverPDIPC(SolverBase):
     def _translate(self, q: np.ndarray | None = None, body_q: np.ndarray | None = None) -> None:
         """Makes the scene; q, body_q: where particles and bodies are, None for where the model has them."""
         model = self.model
-        self._q_start = _read(model, "particle_q").copy() if q is None else q
-        self._body_q_start = body_q if body_q is not None or not model.body_count else _read(model, "body_q").copy()
-        options = (*self._tables, self._follow)
-        self._made: Translation = translate.translate(model, self._q_start, self._body_q_start, *options)
-        scene = self._made.scene
-        self._keep_apart_in_float32(scene)
+        q = _read(model, "particle_q").copy() if q is None else q
+        body_q = body_q if body_q is not None or not model.body_count else _read(model, "body_q").copy()
+        made = translate.translate(model, q, body_q, *self._tables, self._follow)
+        scene = made.scene
+        self._keep_apart_in_float32(scene, q)
         refuse(scene, assembly := assemble(scene), scene.simulation.precision)
+        self._q_start, self._body_q_start = q, body_q
+        self._made: Translation = made
         self._particles = np.concatenate([part.particles for part in self._made.parts])
         self._masses = np.zeros(len(assembly.positions))
         self._masses[: len(self._particles)] = self._made.masses
         self._start()
 
-    def _keep_apart_in_float32(self, scene: "Scene") -> None:
+    def _keep_apart_in_float32(self, scene: "Scene", q: np.ndarray) -> None:
         """Newton's states are float32: what is apart must stay so when particles are rounded to that. Raises ValueError where it would not."""
         contact, assembly = scene.contact, assemble(scene)
-        least = SEPARATION_ULPS * float(np.spacing(np.abs(self._q_start).max(), dtype=np.float32))
+        least = SEPARATION_ULPS * float(np.spacing(np.abs(q).max(), dtype=np.float32))
         if contact.activation_distance is None:
             contact.activation_distance = max(assembly.activation_distance, 10.0 * least)
         if contact.minimum_separation is None:
@@ -208,10 +213,12 @@ class SolverPDIPC(SolverBase):
             scene = self._made.scene.model_copy(deep=True)
             scene.simulation.time_step = dt
             self._simulations[dt] = Simulation(build(scene, str(self.device), masses=self._masses))
-        simulation = self._simulations[dt]
+        simulation = self._simulations[dt] = self._simulations.pop(dt)
         if self._now is not None and self._now is not simulation:
             simulation.restore(self._now.checkpoint())
         self._now = simulation
+        if len(self._simulations) > KEPT:
+            del self._simulations[next(iter(self._simulations))]
         return simulation
 
     def _adopt(self, simulation: "Simulation", q: np.ndarray, qd: np.ndarray) -> None:
@@ -246,6 +253,10 @@ class SolverPDIPC(SolverBase):
         body_q = _read(state, "body_q")
         for shape in self._made.shapes:
             if shape.body >= 0 and np.any(body_q[shape.body] != self._body_q[shape.body]):
+                if not (np.isfinite(body_q[shape.body]).all() and np.any(body_q[shape.body][3:])):
+                    raise ValueError(
+                        f"state_in.body_q[{shape.body}] is {body_q[shape.body].tolist()}, which is no place and turn"
+                    )
                 position, turn = translate.placed(body_q[shape.body])
                 simulation.set_pose(shape.name, position, turn.as_matrix(), speed=AT_ONCE)
 
@@ -277,6 +288,10 @@ class SolverPDIPC(SolverBase):
 def _read(of: newton.State | newton.Model, name: str) -> np.ndarray:
     """An array that is there, on the host; on the CPU a view."""
     return getattr(of, name).numpy()
+
+
+def _numpy(array: wp.array) -> np.ndarray:
+    return array.numpy()
 
 
 def _write(to: newton.State, name: str, values: np.ndarray) -> None:

@@ -262,7 +262,7 @@ def _cloth(model: "newton.Model", q: np.ndarray, triangles: np.ndarray, member: 
 def _hinges(model: "newton.Model", member: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the edges with two triangles among the particles `member`: (h, 4) particles, opposite ones first; stiffness and rest angle (h,)."""
     edges = numbers(model.edge_indices, 4).astype(np.int64)
-    own = (edges[:, :2] >= 0).all(axis=1)
+    own = np.asarray((edges[:, :2] >= 0).all(axis=1))
     own[own] = member[edges[own, 2]]
     return edges[own], numbers(model.edge_bending_properties, 2)[own][:, 0], numbers(model.edge_rest_angle)[own]
 

@@ -4,7 +4,8 @@ from typing import Protocol
 
 import warp as wp
 
-from pdipc.barrier.pairs import Exerted
+from pdipc.barrier.pairs import Exerted, FrozenPairs
+from pdipc.barrier.restitution import Restitution
 
 
 class Method(Protocol):
@@ -14,11 +15,15 @@ class Method(Protocol):
     local-global iterations. numbers: see `status`. generation: grows whenever arrays were replaced, so that graphs are recorded anew.
     """
 
-    pairs: object
     iterations: wp.array
     inner: wp.array
     numbers: wp.array
-    generation: int
+
+    @property
+    def pairs(self) -> FrozenPairs: ...
+
+    @property
+    def generation(self) -> int: ...
 
     def start(self) -> None:
         """Before the first outer iteration."""
@@ -34,6 +39,10 @@ class Method(Protocol):
 
     def accept(self) -> None:
         """Line 16: commits the truncated motion to `u` and `x`, and decides whether to go on: `going` and the status in `count`."""
+        ...
+
+    def correct(self, r: Restitution) -> None:
+        """With restitution, where `r.needed`: solves for the motion `r.u_now` whose velocities bodies part with."""
         ...
 
     def exerted(self) -> tuple[Exerted, Exerted]:

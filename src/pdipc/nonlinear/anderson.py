@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -30,7 +31,7 @@ def kernels(real: Real) -> SimpleNamespace:
     small = wp.types.vector(MEMORY, wp.float64)
     square = wp.types.matrix((MEMORY, MEMORY), wp.float64)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         iterations: int,
@@ -44,7 +45,7 @@ def kernels(real: Real) -> SimpleNamespace:
         left_out[0] = iterations
         going_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def push(
         first: int,
         count: int,
@@ -85,7 +86,7 @@ def kernels(real: Real) -> SimpleNamespace:
         partial_out[b] = total
 
     # Long: one thread's bookkeeping and a small system, solved in place.
-    @wp.kernel(module=module)
+    @kernel(module)
     def mix(
         first: int,
         partial: wp.array(dtype=sums),
@@ -170,7 +171,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if stop:
             going_out[0] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def combine(
         first: int,
         known: wp.array(dtype=wp.int32),
@@ -205,7 +206,7 @@ class Anderson:
         self.limits = [real.scalar(tolerance), real.scalar(relative_tolerance)]
         self.blocks = max(1, -(-count // BLOCK))
 
-        def zeros(dtype, shape=1):
+        def zeros(dtype, shape: int | tuple[int, int] = 1):
             return wp.zeros(shape, dtype=dtype, device=device.warp)
 
         self.f_last, self.g_last = zeros(real.vec3, count), zeros(real.vec3, count)

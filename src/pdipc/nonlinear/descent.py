@@ -21,6 +21,7 @@ from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.friction import FrictionTerm
 from pdipc.collision.islands import Islands
 from pdipc.device import blocks
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
@@ -49,12 +50,12 @@ EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
 
-@wp.func
+@func
 def widened(a: Any) -> wp.vec3d:
     return wp.vec3d(wp.float64(a[0]), wp.float64(a[1]), wp.float64(a[2]))
 
 
-@wp.func
+@func
 def squared(a: Any, b: Any) -> wp.float64:
     """|a - b|^2."""
     total = wp.float64(0.0)
@@ -64,7 +65,7 @@ def squared(a: Any, b: Any) -> wp.float64:
     return total
 
 
-@wp.func
+@func
 def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
     """What rotating by `turn`, rad, does beyond turn x arm."""
     angle = wp.length(turn)
@@ -88,7 +89,7 @@ def kernels(real: Real) -> SimpleNamespace:
     slack = wp.constant(wp.float64(SLACK[real.name]))
     least_number = blocks.least(scalar)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def inertia(
         first: int,
         u: wp.array(dtype=vec3),
@@ -109,7 +110,7 @@ def kernels(real: Real) -> SimpleNamespace:
         energy = wide(scale) / wide(h) * squared(u[i], z[i]) + wide(scale) * wide(damping) * squared(u[i], rest[i])
         energy_out[i] = wide(0.5) * energy + beside[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def judge(
         first: int,
         bodies: int,
@@ -164,7 +165,7 @@ def kernels(real: Real) -> SimpleNamespace:
             searching = 0
         searching_out[0] = searching
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def least_fraction(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -191,7 +192,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if worker % wp.block_dim() == 0:
             least_out[b] = least
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def spread_least(
         first: int,
         bodies: int,
@@ -204,7 +205,7 @@ def kernels(real: Real) -> SimpleNamespace:
         for b in range(bodies):
             island_least_out[label[b]] = wp.min(island_least_out[label[b]], least[b])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def turn_back(
         first: int,
         body: wp.array(dtype=wp.int32),
@@ -241,7 +242,7 @@ def kernels(real: Real) -> SimpleNamespace:
             u_end_out[i] = u[i] + f * (u_tilde[i] - u[i]) + arc
             x_end_out[i] = base[i] + u_end_out[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def commit(
         first: int,
         count: wp.array(dtype=wp.int32),
@@ -264,7 +265,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if free[i] == scalar(0.0):
                 lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def commit_energies(
         first: int,
         base_new: wp.array(dtype=wide),
@@ -273,7 +274,7 @@ def kernels(real: Real) -> SimpleNamespace:
         b = first + wp.tid()
         base_old_out[b] = base_new[b]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def crowd(
         first: int,
         pairs: wp.array(dtype=wp.int32),
@@ -315,15 +316,15 @@ def kernels(real: Real) -> SimpleNamespace:
                 if free[i] == scalar(0.0) and closing < scalar(0.0):
                     crowded_out[mover[i]] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def clear(first: int, flags_out: wp.array(dtype=wp.int32)):
         flags_out[first + wp.tid()] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def exempt(first: int, flags_out: wp.array(dtype=wp.int32)):
         flags_out[first + wp.tid()] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def start(
         first: int,
         bodies: int,
@@ -336,7 +337,7 @@ def kernels(real: Real) -> SimpleNamespace:
             squeezed_out[b] = 0
         restrained_out[0] = 0
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def before_search(
         first: int,
         passes: wp.array(dtype=wp.int32),
@@ -349,7 +350,7 @@ def kernels(real: Real) -> SimpleNamespace:
         count_out[status.MOVING] = 0
 
     # Long: one decision, of all that was found out in an iteration.
-    @wp.kernel(module=module)
+    @kernel(module)
     def decide(
         first: int,
         pairs: wp.array(dtype=wp.int32),
@@ -432,7 +433,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if code == status.RUNNING:
             going_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def note_motion(
         first: int,
         free: wp.array(dtype=scalar),
@@ -444,7 +445,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
             count[status.MOVING] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restrain(
         first: int,
         bodies: int,

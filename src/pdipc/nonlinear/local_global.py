@@ -7,6 +7,7 @@ import warp as wp
 
 from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.barrier.restitution import Restitution
+from pdipc.device.language import kernel
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -24,7 +25,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def inertia(
         first: int,
         u_tilde: wp.array(dtype=vec3),
@@ -43,7 +44,7 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[i] = scale / h * (z[i] - u_tilde[i]) - scale * damping * (u_tilde[i] - rest[i])
         increment_out[i] = vec3()
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def measure(
         first: int,
         base: wp.array(dtype=vec3),
@@ -64,12 +65,12 @@ def kernels(real: Real) -> SimpleNamespace:
             moved = scalar(0.0)
         moved_out[i] = moved
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def direct(first: int, u: wp.array(dtype=vec3), u_tilde: wp.array(dtype=vec3), p_out: wp.array(dtype=vec3)):
         i = first + wp.tid()
         p_out[i] = u_tilde[i] - u[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def commit(
         first: int,
         overflow: wp.array(dtype=wp.int32),
@@ -85,7 +86,7 @@ def kernels(real: Real) -> SimpleNamespace:
             x_out[i] = x_end[i]
             u_out[i] = u_end[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def stay(
         first: int,
         u: wp.array(dtype=vec3),
@@ -99,7 +100,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] == scalar(0.0) and mover[i] >= 0 and drive[wp.max(mover[i], 0)] == 0:
             u_tilde_out[i] = u[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def lead(
         first: int,
         base: wp.array(dtype=vec3),

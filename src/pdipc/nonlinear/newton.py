@@ -34,6 +34,7 @@ from pdipc.barrier import exact, friction
 from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device import blocks
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -56,11 +57,11 @@ REBOUND_TOLERANCE = {
 }  # of the one solve for restitution: what is left of it acts as from outside
 
 
-@wp.func
+@func
 def sampled(k: int, number: int, count: int) -> int:
     """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
     # In Warp's language the quotient of integers is one.
-    return (k * count) / number + (k * 37) % (count / number)  # pyright: ignore[reportReturnType]
+    return (k * count) / number + (k * 37) % (count / number)
 
 
 @functools.cache
@@ -70,7 +71,7 @@ def kernels(real: Real) -> SimpleNamespace:
     wide = wp.float64
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def measure(
         first: int,
         p: wp.array(dtype=vec3),
@@ -92,7 +93,7 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[i] = wp.length(rhs[i])
         scale_out[i] = wp.length(inertial[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def lengthen(
         first: int,
         projected: wp.array(dtype=wp.int32),
@@ -111,7 +112,7 @@ def kernels(real: Real) -> SimpleNamespace:
         else:
             stretch_out[0] = scalar(1.0)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def look_ahead(
         first: int,
         base: wp.array(dtype=vec3),
@@ -137,7 +138,7 @@ def kernels(real: Real) -> SimpleNamespace:
             place = base[i] + z[i]
         ahead_out[i] = place
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         u: wp.array(dtype=vec3),
@@ -161,7 +162,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
             p_out[i] = (target[i] - base[i]) - u[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def find_turn(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -224,7 +225,7 @@ def kernels(real: Real) -> SimpleNamespace:
             center_out[b] = widened(origin) + center
             turn_out[b] = turn
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def propose(
         first: int,
         base: wp.array(dtype=vec3),
@@ -259,17 +260,17 @@ def kernels(real: Real) -> SimpleNamespace:
         u_tilde_out[i] = u_tilde
         x_tilde_out[i] = base[i] + u_tilde
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def any_driven(first: int, movers: int, drive: wp.array(dtype=wp.int32), any_out: wp.array(dtype=wp.int32)):
         any_out[0] = 0
         for m in range(movers):
             any_out[0] = wp.max(any_out[0], drive[m])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def set_flag(first: int, flag_out: wp.array(dtype=wp.int32)):
         flag_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def choose(
         first: int,
         hits: wp.array(dtype=wp.int32),
@@ -293,7 +294,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 renew = int(0)
         renew_out[0] = renew
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def compare(
         first: int,
         free: wp.array(dtype=scalar),
@@ -307,7 +308,7 @@ def kernels(real: Real) -> SimpleNamespace:
         a_out[i] = free[i] * wp.length(a[i])
         b_out[i] = free[i] * wp.length(b[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def leave_saddle(
         first: int,
         free: wp.array(dtype=scalar),
@@ -321,7 +322,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] > scalar(0.0) and lengths[0] <= limit and lengths[1] > scalar(0.0):
             p[i] = p[i] + lengths[0] / lengths[1] * direction[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def restart(first: int, free: wp.array(dtype=scalar), p: wp.array(dtype=vec3)):
         i = first + wp.tid()
         if free[i] > scalar(0.0):

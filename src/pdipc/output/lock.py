@@ -31,6 +31,8 @@ class Lock:
 
     def __init__(self, folder: Path):
         path = folder / NAME
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115  (held for as long as the lock is)
         try:
             _take(self._file, path)

@@ -24,6 +24,7 @@ import os
 import platform
 import shutil
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -42,7 +43,12 @@ FOLDERS = ("frames", "forces", "checkpoints", "segments")
 NAMES = {"run.json", "scene.json", "topology.npz", "stats.jsonl", "run.vtkhdf", *FOLDERS, lock.NAME}
 CHECKPOINTS_KEPT = 2
 NO_ROOM = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC), None}  # None: what NumPy says of a full disk
-UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
+# what reading a damaged file can raise: RuntimeError where an archive calls itself encrypted or packed in another way, MemoryError where
+# an array says that it is huge, TypeError and AttributeError where one kind of file stands in for another
+UNREADABLE = (
+    *(OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 
 
 class RunError(RuntimeError):
@@ -76,9 +82,12 @@ class RunWriter:
         written.
         """
         folder = Path(folder)
-        if folder.exists() and not folder.is_dir():
-            raise RunError(f"{folder} is a file; a run needs a folder")
-        present = {entry.name for entry in folder.iterdir() if not entry.name.endswith(".tmp")} if folder.exists() else set()
+        with _room(folder):
+            if folder.exists() and not folder.is_dir():
+                raise RunError(f"{folder} is a file; a run needs a folder")
+            present = (
+                {entry.name for entry in folder.iterdir() if not entry.name.endswith(".tmp")} if folder.exists() else set()
+            )
         # a run whose making was killed has no run.json yet, but a lock; without either, the files are somebody else's
         if foreign := sorted(present - NAMES if present & {"run.json", lock.NAME} else present):
             raise RunError(f'{folder} holds other files, such as "{foreign[0]}"; name a new folder for the run')
@@ -209,6 +218,12 @@ def _lock(folder: Path) -> lock.Lock:
         raise RunLockedError(str(error)) from None
 
 
+def resumable_step(run: "Run") -> int:
+    """The step that `RunWriter.resume` goes on from; 0, too, where a run begins again."""
+    checkpoint = _latest_checkpoint(run)
+    return 0 if checkpoint is None else checkpoint[0]
+
+
 def _latest_checkpoint(run: "Run") -> tuple[int, dict[str, np.ndarray]] | None:
     steps = {record["step"] for record in run.records}
     for path in sorted((run.folder / "checkpoints").glob("*.npz"), key=_step_of, reverse=True):
@@ -237,7 +252,9 @@ def _room(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        said = f"{error.filename or folder} cannot be written: {error.strerror or error}"
+        name = str(error.filename or folder)
+        name = name if len(name) <= 300 else f"{name[:300]}..."
+        said = f"{name} cannot be written: {error.strerror or error}"
         if error.errno in NO_ROOM:
             said += "; what there is so far is kept: make room, then go on with --resume"
         raise RunError(said) from error
@@ -287,9 +304,11 @@ class Run:
             raise IndexError(f"{self.folder} has no frame {frame}; it has {self.frame_count} frames") from None
         path = _frame(self.folder, record["step"])
         try:
-            found = np.load(path)
+            found = _regular(np.load, path)
+            if not isinstance(found, np.ndarray):
+                raise ValueError("it holds several arrays")
         except UNREADABLE as error:
-            raise RunError(f"{path} cannot be read: {error}") from error
+            raise _unreadable(path, error) from error
         right = (len(self.topology["body_of_vertex"]), 3)
         if found.shape != right or found.dtype.kind != "f":
             raise RunError(
@@ -337,7 +356,7 @@ class Run:
                     raise ValueError(f"{name} names what is not there")
             return ContactForces.from_arrays(self.body_names, n, {name: arrays[name] for name in right})
         except UNREADABLE as error:
-            raise RunError(f"{path} cannot be read: {error}") from error
+            raise _unreadable(path, error) from error
 
     @property
     def triangles(self) -> np.ndarray:
@@ -402,15 +421,19 @@ class Run:
                     arrays = _read_arrays(path)
                     yield step, outer, arrays["start"].astype(np.float64), arrays["end"].astype(np.float64)
                 except UNREADABLE as error:
-                    raise RunError(f"{path} cannot be read: {error}") from error
+                    raise _unreadable(path, error) from error
 
 
 def open_run(folder: str | Path) -> Run:
     """Reads the run in `folder`. Raises RunError where there is none, or it is damaged."""
     folder = Path(folder)
-    if not folder.exists():
+    try:
+        there = folder.exists()
+    except (OSError, ValueError) as error:  # a name that no folder can have
+        raise _unreadable(Path(_short(str(folder))), error) from error
+    if not there:
         raise RunError(f"{folder} does not exist")
-    if not (folder / "run.json").is_file():
+    if not (folder / "run.json").exists():
         runs = sorted(own.parent.name for own in folder.glob("*/run.json"))
         hint = f"; it holds {len(runs)}: name one, such as {folder / runs[0]}" if runs else ""
         raise RunError(f"{folder} is not a run folder: it has no run.json{hint}")
@@ -437,19 +460,33 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    _write(path, lambda file: np.savez(file, **{name: np.asarray(array) for name, array in arrays.items()}))
+    named: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    _write(path, lambda file: np.savez(file, **named))
+
+
+def _regular(read: Callable, path: Path, **options: Any) -> Any:
+    """What `read` makes of a file; a pipe or a device, at which it might wait forever, is not opened."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError("it is no regular file")
+    return read(path, **options)
+
+
+def _unreadable(path: Path, error: BaseException) -> RunError:
+    said = "it needs more memory than there is" if isinstance(error, MemoryError) else " ".join(str(error).split())
+    said = said or type(error).__name__
+    return RunError(f"{path} cannot be read: {said if len(said) <= 300 else said[:297] + '...'}")
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path) as arrays:  # verifies the checksum of each
+    with _regular(np.load, path) as arrays:  # verifies the checksum of each
         return {name: arrays[name] for name in arrays.files}
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise RunError(f"{path} cannot be read: {error}") from error
+        found = json.loads(_regular(Path.read_text, path, encoding="utf-8"))
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
     if not isinstance(found, dict):
         raise RunError(f"{path} holds {_short(found)}; it must hold a table")
     return found
@@ -471,7 +508,7 @@ def _read_topology(path: Path) -> dict[str, np.ndarray]:
     try:
         found = _read_arrays(path)
     except UNREADABLE as error:
-        raise RunError(f"{path} cannot be read: {error}") from error
+        raise _unreadable(path, error) from error
     if "body_names" in found:
         found.setdefault("body_radii", np.zeros(found["body_names"].shape))  # runs of earlier versions have no rods
     lengths: dict[str, int] = {}
@@ -524,9 +561,9 @@ def _read_records(path: Path) -> list[dict[str, Any]]:
     """The complete lines; a last one that a kill cut short does not count."""
     records: list[dict[str, Any]] = []
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path} cannot be read: {error}") from error
+        lines = _regular(Path.read_text, path, encoding="utf-8").split("\n")[:-1]
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
     last = {"step": -1, "time": -math.inf}
     for number, line in enumerate(lines, 1):
         where = f"{path}, line {number}"

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.constraints import Projector
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Reducer
 from pdipc.device.precision import Real
 from pdipc.paper_mode.targets import INNER_RATE, PaperPairs
@@ -18,7 +19,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         iterations: int,
@@ -30,7 +31,7 @@ def kernels(real: Real) -> SimpleNamespace:
         left_out[0] = iterations
         going_out[0] = 1
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def move(
         first: int,
         increment: wp.array(dtype=vec3),
@@ -49,7 +50,7 @@ def kernels(real: Real) -> SimpleNamespace:
         moved_out[i] = free[i] * wp.length(increment[i])
         momentum_out[i] = scalar(0.5) * mass[i] / (h * h) * wp.length_sq(x - z[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def decide(
         first: int,
         rate: scalar,

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from pdipc.barrier.pairs import Exerted
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL
@@ -22,12 +23,12 @@ def kernels(real: Real):
     scalar, vec3 = real.scalar, real.vec3
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def measure_squared(first: int, u: wp.array(dtype=vec3), u_end: wp.array(dtype=vec3), moved_out: wp.array(dtype=scalar)):
         i = first + wp.tid()
         moved_out[i] = wp.length_sq(u_end[i] - u[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def decide(
         first: int,
         pairs: wp.array(dtype=wp.int32),

@@ -21,8 +21,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.barrier import potential as barrier
-from pdipc.barrier.pairs import ActivePairs
+from pdipc.barrier.pairs import FrozenPairs
 from pdipc.collision.candidates import Candidates
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
@@ -35,7 +36,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
     module = real.module(__name__)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def remember(
         first: int,
         x: wp.array(dtype=vec3),
@@ -47,7 +48,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         motion_out[i] = (scalar(1.0) - fraction[i]) * (x_tilde[i] - x[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def project(
         span: Span,
         count: wp.array(dtype=wp.int32),
@@ -88,7 +89,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 if response > scalar(0.0):
                     pull_out[k] = stiffness[k] * steep + lightest / (h * h)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
@@ -125,7 +126,7 @@ def kernels(real: Real) -> SimpleNamespace:
         drag_out[v] = drag
         offset_out[v] = offset
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def linearize(
         first: int,
         x: wp.array(dtype=vec3),
@@ -137,7 +138,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         rhs[i] = rhs[i] + drag[i] - total[i] * (x_tilde[i] - x[i])
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def vertex_energy(
         first: int,
         x: wp.array(dtype=vec3),
@@ -154,11 +155,13 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(remember=remember, project=project, gather=gather, linearize=linearize, vertex_energy=vertex_energy)
 
 
-class PaperPairs(ActivePairs):
-    """Barrier constraints by Eq. (6). scalar: (n,) what they add to the diagonal, kg/s^2; see `ActivePairs`.
+class PaperPairs(FrozenPairs):
+    """Barrier constraints by Eq. (6). scalar: (n,) what they add to the diagonal, kg/s^2; see `FrozenPairs`.
 
     mass: (n,) kg. restitution: eps in [0, 1]. h: s.
     """
+
+    diagonal = apply = None  # `scalar` is the whole contribution
 
     def __init__(
         self,
@@ -178,7 +181,6 @@ class PaperPairs(ActivePairs):
         self.mass, self.restitution, self.h, self.own = mass, real.scalar(restitution), real.scalar(h), kernels(real)
         self.motion, self.drag = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         self.scalar, self.offset, self.still = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(3))
-        self.diagonal, self.apply = None, None
 
     def _allocate(self, capacity: int) -> None:
         super()._allocate(capacity)
@@ -189,8 +191,10 @@ class PaperPairs(ActivePairs):
         fraction = self.still if fraction is None else fraction
         self.device.launch(self.own.remember, len(x), [x, x_tilde, fraction, self.motion])
 
-    def freeze(self, candidates: Candidates, x: wp.array) -> None:
-        super().freeze(candidates, x)
+    def freeze(
+        self, candidates: Candidates, x: wp.array, ahead: wp.array | None = None, driven: wp.array | None = None
+    ) -> None:
+        super().freeze(candidates, x, ahead, driven)
         k = self.own
         pairs = [self.weights, self.normals]
         rest = [self.gaps, self.activation, self.stiffness, self.mass, self.free, self.motion, self.restitution, self.h]

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ def film(path: Path, size: tuple[int, int], rate: float) -> Iterator[Callable[[n
     """
     import imageio_ffmpeg
 
+    write_frames: Any = imageio_ffmpeg.write_frames  # takes more than its defaults say
     kind = path.suffix.lower()
     if kind not in (".mp4", ".gif"):
         raise ValueError(f'"{path}": a film ends in .mp4 or .gif')
@@ -28,7 +30,7 @@ def film(path: Path, size: tuple[int, int], rate: float) -> Iterator[Callable[[n
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".film") as folder:
         whole = Path(folder) / ("film.mp4" if kind == ".mp4" else "film.mkv")
         codec, quality, pixels = ("libx264", MP4, "yuv420p") if kind == ".mp4" else ("libx264rgb", WHOLE, "rgb24")
-        writer = imageio_ffmpeg.write_frames(
+        writer = write_frames(
             str(whole),
             size,
             fps=rate,

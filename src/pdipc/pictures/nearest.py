@@ -1,12 +1,13 @@
 """Questions to a surface: a field at points near it, and what it hides."""
 
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 
 from pdipc.device import system
-from pdipc.device.precision import kernel
+from pdipc.device.language import kernel
 
 
 def values(positions: np.ndarray, triangles: np.ndarray, field: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
@@ -21,7 +22,7 @@ def values(positions: np.ndarray, triangles: np.ndarray, field: np.ndarray, poin
         mesh = wp.Mesh(wp.array(positions, dtype=wp.vec3f), wp.array(triangles.ravel(), dtype=wp.int32))
         out = wp.zeros(len(points), dtype=wp.float32)
         inputs = [mesh.id, wp.array(field, dtype=wp.float32), wp.array(points, dtype=wp.vec3f), float(reach), out]
-        wp.launch(kernels()["values"], len(points), inputs)
+        wp.launch(kernels().values, len(points), inputs)
         return out.numpy().astype(np.float64)
 
 
@@ -33,12 +34,12 @@ def hidden(positions: np.ndarray, triangles: np.ndarray, points: np.ndarray, eye
     with wp.ScopedDevice("cpu"):
         mesh = wp.Mesh(wp.array(positions, dtype=wp.vec3f), wp.array(triangles.ravel(), dtype=wp.int32))
         out = wp.zeros(len(points), dtype=wp.int32)
-        wp.launch(kernels()["hidden"], len(points), [mesh.id, wp.array(points, dtype=wp.vec3f), wp.vec3f(*eye), out])
+        wp.launch(kernels().hidden, len(points), [mesh.id, wp.array(points, dtype=wp.vec3f), wp.vec3f(*eye), out])
         return out.numpy() != 0
 
 
 @functools.cache
-def kernels() -> dict[str, wp.Kernel]:
+def kernels() -> SimpleNamespace:
     """Those of `values` and `hidden`, a point each."""
     module = wp.get_module(__name__)
     module.options["enable_backward"] = False
@@ -65,4 +66,4 @@ def kernels() -> dict[str, wp.Kernel]:
         if wp.mesh_query_ray(mesh, eye, way, 0.999).result:
             out[i] = 1
 
-    return {"values": nearest_values, "hidden": hidden}  # pyright: ignore[reportReturnType]
+    return SimpleNamespace(values=nearest_values, hidden=hidden)

@@ -192,7 +192,7 @@ class Drawing:
         width, height = size
         self.beside = legend.width(width, height) if field is not None else 0
         self.size = (width - self.beside, height)
-        self.plotter = pyvista.Plotter(off_screen=True, window_size=list(JUDGED), lighting="none")
+        self.plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(JUDGED), lighting="none")
         self.window: Any = self.plotter.ren_win
         self.window.SetMultiSamples(0)
         self.plotter.renderer.SetUseOIT(False)  # passes over the whole picture, for what alike grey obstacles do not need
@@ -284,8 +284,8 @@ class Drawing:
         """The camera where the settings say, or as near as all points seen (k, 3) allow."""
         settings, camera = self.settings, self.plotter.camera
         target = np.array(settings.target) if settings.target is not None else self.center
-        if settings.position is not None:
-            position = np.array(settings.position)
+        position = None if settings.position is None else np.array(settings.position)
+        if position is not None:
             view = (position - target) / np.linalg.norm(position - target)
         else:
             view = np.array(settings.view or VIEW)
@@ -293,7 +293,7 @@ class Drawing:
         right = np.cross([0.0, 1.0, 0.0], view)
         right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-9 else np.array([1.0, 0.0, 0.0])
         up = np.cross(view, right)
-        if settings.position is None:
+        if position is None:
             slope, away = np.tan(np.radians(ANGLE / 2)) * 0.9, seen - target
             aspect = self.size[0] / self.size[1]
             needed = np.maximum(np.abs(away @ up) / slope, np.abs(away @ right) / (slope * aspect)) + away @ view
@@ -364,8 +364,9 @@ class Drawing:
         for light in everywhere:
             light.on = not lamp
         lamp_light.on = bool(lamp)
-        for body in (*self.bodies, *self.grounds) if lamp is not None else ():
-            body.light(lamp)
+        if lamp is not None:
+            for body in (*self.bodies, *self.grounds):
+                body.light(lamp)
         background = self.settings.background
         dark = lamp or lamp is None or background == "transparent"
         self.plotter.set_background("black" if dark else background)
@@ -392,7 +393,8 @@ class Drawing:
         frame = np.eye(4)
         frame[:3] = np.stack([np.cross(away, up), up, away, camera.position], axis=1)
         slope = np.tan(np.radians(camera.view_angle / 2))
-        return Camera(frame, *camera.clipping_range, (slope * self.size[0] / self.size[1], slope))
+        near, far = camera.clipping_range
+        return Camera(frame, near, far, (slope * self.size[0] / self.size[1], slope))
 
     def _seen_by_lamp(self) -> tuple[np.ndarray, np.ndarray]:
         """(k, l) float32: how far the lamp's light gets, in [0, 1]; (4, 4): places to x, y, depth in [0, 1] of that."""
@@ -469,7 +471,7 @@ class _Body:
                 look_up.update(clim=(UNLOADED * top, top), below_color=color)
         self.wireframe = settings.wireframe
         self.edges = (settings.edges if look.edges is None else look.edges) and not self.wireframe
-        self.actor = plotter.add_mesh(
+        self.actor: Any = plotter.add_mesh(
             self.mesh,
             **look_up,
             style="wireframe" if self.wireframe else "surface",
@@ -590,9 +592,9 @@ class _Ground:
         near = _rgb(look.color) if look.color else 0.92 * far + (40.0 if far.mean() < 128.0 else 0.0)
         parts = ((1.0 - GROUND_LIT) * (1.0 - faded) * near + faded * far, GROUND_LIT * (1.0 - faded) * near)
         self.colors = [(part + 0.5).astype(np.uint8) for part in parts]
-        self.mesh = disc
+        self.mesh: Any = disc
         self.mesh["color"] = self.colors[0]
-        self.actor = drawing.plotter.add_mesh(self.mesh, scalars="color", rgb=True, lighting=False, reset_camera=False)
+        self.actor: Any = drawing.plotter.add_mesh(self.mesh, scalars="color", rgb=True, lighting=False, reset_camera=False)
         self.actor.prop.culling = "back"  # seen from below it would hide everything
 
     @staticmethod

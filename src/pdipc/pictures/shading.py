@@ -9,12 +9,14 @@ obscurance", McGuire et al. 2012). Samples are the same for every pixel, so that
 
 import functools
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
-from pdipc.device.precision import kernel
 
 LAMP_TAPS, BLOCKER_TAPS, OPEN_TAPS = 48, 16, 32  # samples
 COARSE = 2  # pixels a side that share the samples of shade, which changes little from one to the next
@@ -24,29 +26,29 @@ STEEPEST = 20.0  # slope towards the lamp up to which the samples of a shadow fo
 ONE_SURFACE = 12.0  # a pixel shows one surface if its depth varies by less than so many of its sizes
 
 
-@wp.struct
+@struct
 class _View:
     """What the camera sees. Places are (right, up, away) of it, m."""
 
-    depth: wp.array2d(dtype=wp.float32)
+    depth: wp.array2d[wp.float32]
     near: float
     far: float
     slope: wp.vec2f  # of the rays through the picture's edges: half its width and half its height at distance 1
     pixel: float  # height of a drawn pixel at distance 1
     radius: float  # of what shades by its nearness, m
-    taps: wp.array(dtype=wp.vec2f)
+    taps: wp.array[wp.vec2f]
 
 
-@wp.struct
+@struct
 class _Lamp:
     """What the lamp reaches."""
 
-    seen: wp.array2d(dtype=wp.float32)
+    seen: wp.array2d[wp.float32]
     matrix: wp.mat44f  # places to u, v, depth in [0, 1] of that
     scale: wp.vec3f  # m per unit of u, v, depth
     way: wp.vec3f  # towards the lamp
-    taps: wp.array(dtype=wp.vec2f)
-    blocker_taps: wp.array(dtype=wp.vec2f)
+    taps: wp.array[wp.vec2f]
+    blocker_taps: wp.array[wp.vec2f]
 
 
 @dataclass
@@ -95,13 +97,13 @@ def compose(
     step = COARSE * oversampled
     coarse = wp.ones((-(-depth.shape[0] // step), -(-depth.shape[1] // step)), dtype=wp.float32, device="cpu")
     if radius > 0.0:
-        device.launch(kernels()["shade"], coarse.size, [step, view, coarse], grain=100)
+        device.launch(kernels().shade, coarse.size, [step, view, coarse], grain=100)
     inputs = [oversampled, width, _array(everywhere, wp.uint8), _array(lamp, wp.uint8), view, light, coarse, out]
-    device.launch(kernels()["compose"], height * width, inputs, grain=100)
+    device.launch(kernels().compose, height * width, inputs, grain=100)
     return out.numpy().reshape(height, width, 4)
 
 
-def _array(values: np.ndarray, dtype: type) -> wp.array:
+def _array(values: np.ndarray, dtype: type) -> Any:
     return wp.array(values, dtype=dtype, device="cpu", copy=False)
 
 
@@ -114,17 +116,17 @@ def _disc(count: int, power: float) -> wp.array:
 
 
 @functools.cache
-def kernels() -> dict[str, wp.Kernel]:
+def kernels() -> SimpleNamespace:
     """shade: how open the half-space is, for blocks of pixels; compose: a pixel of the picture each."""
     module = wp.get_module(__name__)
     module.options["enable_backward"] = False
 
-    @wp.func
+    @func
     def away(view: _View, x: int, y: int) -> float:
         """How far away what is drawn in column x and row y is."""
         return view.near * view.far / (view.far - view.depth[y, x] * (view.far - view.near))
 
-    @wp.func
+    @func
     def place(view: _View, x: int, y: int) -> wp.vec3f:
         """Of what is drawn in column x and row y."""
         z = away(view, x, y)
@@ -132,7 +134,7 @@ def kernels() -> dict[str, wp.Kernel]:
         v = (2.0 * (float(y) + 0.5) / float(view.depth.shape[0]) - 1.0) * view.slope[1]
         return wp.vec3f(u * z, v * z, z)
 
-    @wp.func
+    @func
     def along(view: _View, here: wp.vec3f, x: int, y: int, dx: int, dy: int) -> wp.vec3f:
         """Along the surface in the direction (dx, dy): from the neighbour before or after, whichever is nearer in depth."""
         after = place(view, wp.min(x + dx, view.depth.shape[1] - 1), wp.min(y + dy, view.depth.shape[0] - 1)) - here
@@ -141,7 +143,7 @@ def kernels() -> dict[str, wp.Kernel]:
             return after
         return before
 
-    @wp.func
+    @func
     def reached(lamp: _Lamp, i: int, j: int, at: wp.vec3f, steep: wp.vec2f) -> float:
         """1 where the lamp's light gets, at entry (j, i), as far as the plane through `at` that has the slopes `steep`."""
         u = (float(i) + 0.5) / float(lamp.seen.shape[1]) - at[0]
@@ -149,7 +151,7 @@ def kernels() -> dict[str, wp.Kernel]:
         there = lamp.seen[j, i]  # 1 where nothing is in the way
         return wp.where(there < 1.0 and there < at[2] + steep[0] * u + steep[1] * v, 0.0, 1.0)
 
-    @wp.func
+    @func
     def lit(lamp: _Lamp, u: float, v: float, at: wp.vec3f, steep: wp.vec2f) -> float:
         """Part of the light at (u, v) that gets as far as the plane, of the four nearest entries; all of it outside."""
         x, y = u * float(lamp.seen.shape[1]) - 0.5, v * float(lamp.seen.shape[0]) - 0.5
@@ -161,7 +163,7 @@ def kernels() -> dict[str, wp.Kernel]:
         above = (1.0 - a) * reached(lamp, i, j + 1, at, steep) + a * reached(lamp, i + 1, j + 1, at, steep)
         return (1.0 - b) * below + b * above
 
-    @wp.func
+    @func
     def in_sight(lamp: _Lamp, here: wp.vec3f, normal: wp.vec3f, slack: float) -> float:
         """Part of the lamp that is in sight from `here`, where it is within `slack`, m."""
         if wp.dot(normal, lamp.way) <= 1.0 / STEEPEST:
@@ -196,7 +198,7 @@ def kernels() -> dict[str, wp.Kernel]:
             total += lit(lamp, at[0] + to[0], at[1] + to[1], at, steep)
         return total / float(LAMP_TAPS)
 
-    @wp.func
+    @func
     def openness(view: _View, here: wp.vec3f, normal: wp.vec3f, x: int, y: int) -> float:
         """How much of the half-space above `here` nothing covers within the radius."""
         covered = float(0.0)
@@ -212,13 +214,13 @@ def kernels() -> dict[str, wp.Kernel]:
                     covered += near * near * near * wp.max(wp.dot(to, normal) - 0.04, 0.0) / (square + 0.01)
         return wp.max(1.0 - 1.6 * covered / float(OPEN_TAPS), 0.0)
 
-    @wp.func
+    @func
     def normal_at(view: _View, here: wp.vec3f, x: int, y: int) -> wp.vec3f:
         """Of the surface in column x and row y, towards the camera."""
         normal = wp.normalize(wp.cross(along(view, here, x, y, 1, 0), along(view, here, x, y, 0, 1)))
         return wp.where(wp.dot(normal, here) > 0.0, -normal, normal)
 
-    @wp.func
+    @func
     def shared(
         view: _View, coarse: wp.array2d(dtype=wp.float32), step: int, here: wp.vec3f, normal: wp.vec3f, x: int, y: int
     ) -> float:
@@ -241,7 +243,7 @@ def kernels() -> dict[str, wp.Kernel]:
             return total / weights
         return openness(view, here, normal, x, y)
 
-    @wp.func
+    @func
     def parts(
         view: _View, lamp: _Lamp, coarse: wp.array2d(dtype=wp.float32), step: int, x: int, y: int, lamp_counts: bool
     ) -> wp.vec2f:
@@ -307,4 +309,4 @@ def kernels() -> dict[str, wp.Kernel]:
             out[i, c] = wp.uint8(color[c] * share + 0.5)
         out[i, 3] = wp.uint8(255.0 * cover * share + 0.5)
 
-    return {"shade": shade, "compose": compose}  # pyright: ignore[reportReturnType]
+    return SimpleNamespace(shade=shade, compose=compose)

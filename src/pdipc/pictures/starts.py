@@ -1,6 +1,7 @@
 """A picture of where a scene intersects at its start, with PyVista."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def draw_start(assembly: Assembly, path: str | Path) -> int:
     x, triangles = assembly.positions, assembly.triangles
     pairs = find_intersections(x, triangles, assembly.obstacle)
     wrong = np.unique(pairs)
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), shape=(1, 2), border=False)
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(SIZE), shape=(1, 2), border=False)
     seen = [x[triangles].reshape(-1, 3)[:: max(1, 3 * len(triangles) // 30000)], x[triangles[wrong]].reshape(-1, 3)]
     moving = ~assembly.obstacle
     if moving.any():  # a large floor is not framed

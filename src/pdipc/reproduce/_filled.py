@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.system import start_warp
-from pdipc.scene.meshes import boundary
+from pdipc.scene.meshes import Mesh, boundary
 from pdipc.scene.stuffing import stuffed
 
 VERSION = b"2"  # of what is kept
@@ -46,12 +47,17 @@ def filled(
     scale = float((high - low).max())
     level = _enclosed((vertices - low) / scale, triangles)
     cells = 40.0
-    for _ in range(TRIES):
-        mesh = stuffed(level, np.zeros(3), (high - low) / scale, 1.0 / cells)
+
+    def made() -> Mesh:
+        return stuffed(level, np.zeros(3), (high - low) / scale, 1.0 / cells)
+
+    mesh = made()
+    for _ in range(TRIES - 1):
         ratio = elements / len(mesh.tets)
         if abs(ratio - 1.0) < CLOSE:
             break
         cells *= ratio ** (1.0 / DENSE)
+        mesh = made()
     points, tets = with_finer_surface(mesh.vertices, mesh.tets, surface_splits)
     print(f"{label}: {len(triangles)} triangles filled with {len(tets)} tets, {len(points)} vertices", flush=True)
     found = {"V": scale * points + low, "T": tets}
@@ -88,7 +94,7 @@ def with_finer_surface(points: np.ndarray, tets: np.ndarray, splits: int) -> tup
     return points, tets
 
 
-@wp.kernel
+@kernel(wp.get_module(__name__))
 def _distances(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, out: wp.array(dtype=float)):
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach, 2.0, 0.5)

@@ -8,13 +8,15 @@ import numpy as np
 import warp as wp
 
 from pdipc.barrier.potential import EXTENSION
-from pdipc.drive import Work, step
+from pdipc.drive import step
 from pdipc.integration import status
 from pdipc.model import Model, State, build
+from pdipc.nonlinear.local_global import LocalGlobal
 from pdipc.paper_mode import energy_rate
 from pdipc.paper_mode.printed import Printed
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
+from pdipc.work import Work
 
 WAYS = {
     "truncated after each L-G iteration": {"method": "paper", "inner_iterations": 1},
@@ -42,8 +44,10 @@ class Watched(Work):
     def __init__(self, model: Model):
         super().__init__(model, recorded=False)
         self.trace, self.lowest = Trace(), 0
-        self.method._local_global = self._seen(self.method._local_global, self._after_local_global)
-        self.method.accept = self._seen(self.method.accept, self._after_outer)
+        method = self.method
+        assert isinstance(method, LocalGlobal | Printed)
+        method._local_global = self._seen(method._local_global, self._after_local_global)
+        method.accept = self._seen(method.accept, self._after_outer)
 
     @staticmethod
     def _seen(launches: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
@@ -85,14 +89,14 @@ def potential(work: Work) -> float:
     if isinstance(method, Printed):
         return float(method.loop.energies.numpy()[energy_rate.TOTAL])
     model, h = work.model, work.model.settings.time_step
-    x, z, start = (array.numpy() for array in (work.u_tilde, work.z, work.u))
+    x, z, start = (np.asarray(array.numpy()) for array in (work.u_tilde, work.z, work.u))
     inertia = 0.5 * float((model.mass.numpy()[:, None] * (x - z) ** 2).sum()) / h**2
     elastic = wp.zeros(1, dtype=model.real.scalar, device=model.device.warp)
     model.projector.energy(work.x_start, work.u_tilde, elastic, 0)
     p = work.pairs
     count = int(p.count.numpy()[0])
     quads, a, n, gap, d_hat, stiffness = (
-        array.numpy()[:count] for array in (p.quads, p.weights, p.normals, p.gaps, p.activation, p.stiffness)
+        np.asarray(array.numpy()[:count]) for array in (p.quads, p.weights, p.normals, p.gaps, p.activation, p.stiffness)
     )
     delta = gap + (n * (a[:, :, None] * (x - start)[quads]).sum(axis=1)).sum(axis=1)
     at = np.clip(np.maximum(delta, EXTENSION * gap), None, d_hat)

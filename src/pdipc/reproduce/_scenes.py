@@ -261,7 +261,7 @@ def sewn(vertices: np.ndarray, triangles: np.ndarray, within: float) -> list[tup
     for own in np.unique(piece[rim]):
         mine, others = rim[piece[rim] == own], rim[piece[rim] != own]
         if len(others):
-            far, near = cKDTree(vertices[others]).query(vertices[mine])
+            far, near = (np.asarray(each) for each in cKDTree(vertices[others]).query(vertices[mine]))
             partner |= {int(a): int(others[b]) for a, b, d in zip(mine, near, far, strict=True) if d < within}
     return sorted({(min(a, b), max(a, b)) for a, b in partner.items() if partner.get(b) == a})
 

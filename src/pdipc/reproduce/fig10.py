@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def falling(radius: float, small: bool) -> Scene:
     """The dinosaur, lying on its side, 5 mm above three rods along z. 1 m tall, 0.4 m wide, 1.2 m from head to tail."""
     path = None if small else _common.data("meshes/tet/dinosaur_97k.npz")
     cell = 0.08 if small else 0.025
-    mesh = str(path) if path else _common.creature(_common.DINOSAUR, cell)
+    mesh: Any = str(path) if path else _common.creature(_common.DINOSAUR, cell)
     lowest = np.load(path)["V"][:, 0].min() if path else mesh["vertices"][:, 0].min()
     rods = [
         {

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -133,7 +134,8 @@ def _draw(theirs: Run, ours: Run, rows: list[tuple], path: Path) -> None:
     last = ours.frame_count - 1
     frames = [0, min(theirs.frame_count - 1, last // 3), round(0.75 * last), last]  # the second is one that IPC has, too
     figure = plt.figure(figsize=(11, 9.2), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
+    upper, lower = parts
     for line, (method, done) in zip(upper.subplots(2, len(frames)), (("IPC", theirs), ("this package", ours)), strict=True):
         there = [frame for frame in frames if frame < done.frame_count]
         for axis, image, frame in zip(line, _common.pictures(done, there, (640, 480), VIEW, [0]), there, strict=False):

@@ -14,6 +14,7 @@ from pdipc.constraints.triangles import rest_shape
 from pdipc.device.launch import Device, Graph
 from pdipc.device.precision import Real, real
 from pdipc.linear import System, make_solver
+from pdipc.linear.paper.powers import MatrixPowers
 from pdipc.reproduce import _common
 from pdipc.scene.generators import Grid
 
@@ -86,7 +87,7 @@ class Run:
 
     def graph(self, count: int) -> Graph:
         """The recorded solve with `count` iterations; what depends on the matrix alone is prepared."""
-        self.solver.limits[1] = count * (self.solver.order if self.name == "matrix-powers" else 1)
+        self.solver.limits[1] = count * (self.solver.order if isinstance(self.solver, MatrixPowers) else 1)
         return self.system.device.capture(lambda: self.solver.solve(self.x, self.b, prepared=True), self.solver)
 
     def result(self, count: int) -> np.ndarray:

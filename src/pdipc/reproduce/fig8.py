@@ -7,6 +7,8 @@ import numpy as np
 
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real, real
+from pdipc.linear.paper.a_jacobi import AJacobi
+from pdipc.linear.paper.powers import MatrixPowers
 from pdipc.reproduce import _common
 from pdipc.reproduce.fig7 import Run, loads, table_cloth
 
@@ -37,6 +39,7 @@ def measure(side: int, place: Device, precision: Real) -> list[tuple[int, str, f
             continue
         terms = options["order"] / variant.per_iteration()[1]
         base = terms if base is None else base
+        assert isinstance(variant.solver, AJacobi | MatrixPowers)
         rows.append((3 * system.count, label, terms, terms / base, variant.solver.bytes))
     return rows
 

@@ -1,6 +1,7 @@
 """Figure 9: the patches of a mesh, and the hierarchy of their boxes."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -102,7 +103,7 @@ def _picture(x: np.ndarray, culling: PatchCulling, patch: np.ndarray, level: int
     """The mesh with its patches in colours (level None), or pale within the boxes of a level."""
     import pyvista
 
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="three lights")
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="three lights")
     plotter.set_background("white")
     mesh = pyvista.PolyData.from_regular_faces(x, culling.surface.members[2])
     colors = _colors(culling.count)

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from pdipc.drive import Work, step
+from pdipc.drive import step
 from pdipc.model import Model, State, build
 from pdipc.reproduce import _common
 from pdipc.scene.schema import Scene
+from pdipc.work import Work
 
 COLUMNS = (
     "outer",
@@ -71,7 +72,7 @@ def cases() -> dict[str, Case]:
     ball = {"shape": "sphere", "radius": 0.05, "cells": 4}
     rod = {"shape": "cylinder", "radius": 0.005, "length": 0.4, "cells": [8, 4]}
     plate = floor("plate", rotation=(180, 0, 0), translation=(0.7, 0.107, 0.2), motion={"velocity": (0, -0.1, 0), "end": 0.4})
-    away = {"velocity": (-1, 0, 0)}
+    away: dict[str, Any] = {"velocity": (-1, 0, 0)}
     return {
         "stiff box falls": Case([block("box", (0, 0.1, 0), young=1e8)], [floor()], 60, {}, {}, ("rebound", "rest")),
         "soft box falls": Case([block("box", (0, 0.1, 0))], [floor()], 60, {}, {}, ("rebound", "rest")),

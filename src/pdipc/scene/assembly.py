@@ -299,7 +299,9 @@ class Assembly:
         """(k, 3) m: where the points that hold a pin's vertices are at `time` s."""
         path = pin.trajectory if pin.follow < 0 else self.bodies[pin.follow].trajectory
         assert path is not None
-        return path.apply(pin.points, time) if path.is_rigid or pin.glue is None else pin.glue.apply(path.apply(None, time))
+        if isinstance(path, Deforming) and pin.glue is not None:
+            return pin.glue.apply(path.apply(None, time))
+        return path.apply(pin.points, time)
 
     def glued(self, pin: AssembledPin, x: np.ndarray) -> Glue:
         """How a pin's vertices move with the surface that it follows, from where both are at positions x (n, 3) m."""
@@ -408,7 +410,8 @@ def load_deforming(placed: Obstacle, deformation: Deformation, worker: Worker | 
     return meshes.without_useless(first, where, frames.points[1:]), frames
 
 
-Read = tuple[Placed, Mesh, np.ndarray, Frames | None]  # a table, its mesh, where its vertices start, and its cache
+AnyPlaced = Solid | Cloth | Rod | Rigid | Obstacle
+Read = tuple[AnyPlaced, Mesh, np.ndarray, Frames | None]  # a table, its mesh, where its vertices start, and its cache
 
 
 def _read_all(scene: Scene, problems: list[str], notes: list[str], unread: set[str]) -> list[Read]:
@@ -461,7 +464,7 @@ def assemble(scene: Scene) -> Assembly:
     return assembly
 
 
-_Part = tuple[AssembledBody, Placed, Mesh, np.ndarray, np.ndarray]  # body, table, mesh, start, velocities
+_Part = tuple[AssembledBody, AnyPlaced, Mesh, np.ndarray, np.ndarray]  # body, table, mesh, start, velocities
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is found by the check
@@ -519,6 +522,7 @@ def _parts(scene: Scene, problems: list[str], notes: list[str], unread: set[str]
         rest, start = mesh.vertices @ matrix.T + placed.translation, start @ matrix.T + placed.translation
         deforming = None
         if frames is not None:
+            assert isinstance(placed, Obstacle) and isinstance(placed.motion, Deformation)  # what else has none
             deforming = Deforming(frames, placed.motion.start, matrix, placed.translation)
             rest = start = deforming.apply(None, 0.0)
         center = meshes.center_of_mass(replace(mesh, vertices=start)) if isinstance(placed, Body) else np.zeros(3)
@@ -544,12 +548,12 @@ def _parts(scene: Scene, problems: list[str], notes: list[str], unread: set[str]
         for name, offset in _copies(placed):
             body = AssembledBody(
                 name,
-                placed.kind if isinstance(placed, Body) else "obstacle",
+                "obstacle" if isinstance(placed, Obstacle) else placed.kind,
                 first,
                 first + len(rest),
                 mesh.tets + first,
                 mesh.triangles + first,
-                placed.material if isinstance(placed, Body) else None,
+                None if isinstance(placed, Obstacle) else placed.material,
                 half_separation=0.0,
                 friction=scene.contact.friction if placed.friction is None else placed.friction,
                 trajectory=deforming,
@@ -596,8 +600,8 @@ def _laid_out(scene: Scene, parts: list[_Part], notes: list[str]) -> Assembly:
         body.half_separation = 0.5 * (placed.minimum_separation or minimum_separation)
         if isinstance(placed, Rod) and not placed.minimum_separation:
             body.half_separation = placed.material.radius
-        if isinstance(placed, Obstacle):
-            body.trajectory = body.trajectory or Trajectory(placed.motion, _middle(start))
+        if isinstance(placed, Obstacle) and not isinstance(placed.motion, Deformation):
+            body.trajectory = Trajectory(placed.motion, _middle(start))
     return assembly
 
 
@@ -719,7 +723,9 @@ def _attach(assembly: Assembly, table: Attachment, where: str) -> None:
         if not all(np.isfinite(assembly.positions[body.first : body.last]).all() for body in (a, b)):
             return  # the check says so
         near = cKDTree(assembly.positions[b.first : b.first + b.count])
-        distance, nearest = near.query(assembly.positions[a.first : a.first + a.count], distance_upper_bound=table.within)
+        assert table.within is not None  # the table has pairs or this
+        found = near.query(assembly.positions[a.first : a.first + a.count], distance_upper_bound=table.within)
+        distance, nearest = (np.asarray(each) for each in found)
         chosen = np.flatnonzero(np.isfinite(distance))
         pairs = np.column_stack([chosen, nearest[chosen]])
     vertices_a, vertices_b = (pairs[:, 0] + a.first).astype(np.int32), (pairs[:, 1] + b.first).astype(np.int32)
@@ -798,7 +804,7 @@ def _pin(assembly: Assembly, body: AssembledBody, table: Pin, where: str, unread
 
 def _onto(x: np.ndarray, body: AssembledBody, surface: AssembledBody, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The nearest points of a surface to vertices (k,) of a body at positions x (n, 3) m, as `sewing.nearest`."""
-    distances, _ = cKDTree(x[np.unique(surface.triangles)]).query(x[vertices])
+    distances = np.asarray(cKDTree(x[np.unique(surface.triangles)]).query(x[vertices])[0])
     return sewing.nearest(x, body, surface, vertices, (1.0 + 1e-6) * distances.max(initial=0.0) + 1e-12, True)
 
 

@@ -347,7 +347,8 @@ def _fans(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     _, edge = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
     # corners of triangles are connected to the ends of edges, and so to the corners at the same vertex across an edge
     ends = triangles.size + 2 * edge.reshape(-1, 1) + np.argsort(sides, axis=1)
-    graph = scipy.sparse.coo_matrix((np.ones(corners.size), (corners.ravel(), ends.ravel())), shape=2 * (3 * triangles.size,))
+    size = 3 * triangles.size
+    graph = scipy.sparse.coo_matrix((np.ones(corners.size), (corners.ravel(), ends.ravel())), shape=(size, size))
     _, fan = connected_components(graph, directed=False)
     _, first = np.unique(fan[: triangles.size], return_index=True)
     return np.unique(triangles.reshape(-1)[first], return_counts=True)

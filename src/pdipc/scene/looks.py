@@ -22,7 +22,7 @@ NAMED = {
     "brown": "#a9825a",
 }
 LARGEST = 8192  # pixels of a side: what every driver draws
-SIDE = {"ge": 16, "le": LARGEST}
+Side = Annotated[Whole, Field(ge=16, le=LARGEST)]
 
 
 def _hex(color: str) -> str:
@@ -63,7 +63,7 @@ class Look(Table):
 class Picture(Table):
     """How a run is drawn by `pdipc render`, whose options come first, and from where the viewer looks at the start."""
 
-    size: tuple[Annotated[Whole, Field(**SIDE)], Annotated[Whole, Field(**SIDE)]] | None = Field(
+    size: tuple[Side, Side] | None = Field(
         default=None, description="Width and height, pixels; absent: 1280 x 800, of a film 960 x 600."
     )
     view: Annotated[Vector, AfterValidator(_no_zero)] | None = Field(

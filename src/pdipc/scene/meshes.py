@@ -20,7 +20,7 @@ from pdipc.scene.worker import Worker, failed
 
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
 TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".vtp", ".glb")
-USD_SUFFIXES = (".usd", ".usda", ".usdc")
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", *USD_SUFFIXES)
 BYTES_PER_BYTE = 2  # of memory for a mesh file, at least: the file itself and its numbers
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of

@@ -20,7 +20,7 @@ from pdipc.scene.schema import Motion
 SMOOTHEST = 1.5  # the largest slope of 3 s^2 - 2 s^3
 
 
-def rotation_matrix(degrees: Sequence[float]) -> np.ndarray:
+def rotation_matrix(degrees: Sequence[float] | np.ndarray) -> np.ndarray:
     """(3, 3): turns about the fixed axes x, then y, then z."""
     return Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
 

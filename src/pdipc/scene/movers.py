@@ -38,9 +38,9 @@ class Mover:
 
     def place(self, time: float) -> np.ndarray:
         """(k, 3) m: where its script has it at `time`, s."""
-        if self.trajectory.is_rigid:
-            return self.trajectory.apply(self.points, time)
-        return self.with_glued(self.trajectory.apply(None, time))
+        if isinstance(self.trajectory, Deforming):
+            return self.with_glued(self.trajectory.apply(None, time))
+        return self.trajectory.apply(self.points, time)
 
     def with_glued(self, vertices: np.ndarray) -> np.ndarray:
         """(k, 3) m: an obstacle that deforms to `vertices` (n, 3), and what is glued to it."""

@@ -24,7 +24,7 @@ def weld(points: np.ndarray, triangles: np.ndarray, within: float, where: str) -
     size = np.int64(len(points))
     together = np.isin(np.sort(pairs, axis=1) @ [size, 1], sides.astype(np.int64) @ [size, 1])
     pairs = pairs[~together]
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     _, group = connected_components(graph, directed=False)
     _, first = np.unique(group, return_index=True)
     order = np.argsort(first)

@@ -407,4 +407,4 @@ def _neighbour_mean(assembly: Assembly) -> scipy.sparse.csr_array:
     rows, columns = np.concatenate(pairs).T
     graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
     graph.data[:] = 1.0
-    return scipy.sparse.diags_array(1.0 / np.maximum(graph.sum(axis=1), 1.0)) @ graph
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / np.maximum(graph.sum(axis=1), 1.0)) @ graph)

@@ -38,6 +38,7 @@ class _Model(type(BaseModel)):
         try:
             return super().__call__(*args, **tables)
         except ValidationError as error:
+            assert issubclass(cls, BaseModel)
             raise SceneError("\n  ".join(explain(error, tables, cls))) from error
 
 
@@ -59,17 +60,17 @@ class Table(BaseModel, metaclass=_Model):
     def settled(self) -> Self:
         """A copy, down to its last table, that refuses changes: what a model was made from. Arrays are shared."""
         copy = self.model_copy()
-        copy.__dict__.update({name: _settled(value) for name, value in self}, **{SETTLED: True})
+        vars(copy).update({name: _settled(value) for name, value in self}, **{SETTLED: True})
         return copy
 
     def __copy__(self) -> Self:
         copy = super().__copy__()
-        copy.__dict__.pop(SETTLED, None)
+        vars(copy).pop(SETTLED, None)
         return copy
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
         copy = super().__deepcopy__(memo)
-        copy.__dict__.pop(SETTLED, None)
+        vars(copy).pop(SETTLED, None)
         return copy
 
 

@@ -14,7 +14,7 @@ import threading
 import time
 from multiprocessing import spawn
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any
 
 import numpy as np
 import psutil
@@ -67,9 +67,15 @@ class Worker:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         command = [os.fsdecode(executable), "-P", "-c", "from pdipc.scene.worker import serve; serve()"]
         hidden = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows would open one
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
         try:
-            self.process = subprocess.Popen(command, env=environment, creationflags=hidden, **pipes)
+            self.process = subprocess.Popen(
+                command,
+                env=environment,
+                creationflags=hidden,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
         except OSError:
             return False
         if self._ask(None, START_SECONDS, BYTES)[0] is None:
@@ -159,7 +165,8 @@ def _limit_memory() -> None:
         import resource
 
         free = psutil.virtual_memory().available
-        resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + free,) * 2)
+        most = psutil.Process().memory_info().vms + free
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
     except (ImportError, OSError, ValueError):
         pass
 
@@ -185,7 +192,7 @@ def describe(error: BaseException) -> str:
     return text.strip() or type(error).__name__
 
 
-def _send(file: BinaryIO, answer: Contents | str) -> None:
+def _send(file: IO[bytes], answer: Contents | str) -> None:
     arrays = {}
     if isinstance(answer, Contents):
         arrays = {"points": np.asarray(answer.points, dtype=np.float64)}
@@ -202,13 +209,14 @@ def _send(file: BinaryIO, answer: Contents | str) -> None:
     else:
         told = {"failed": answer}
     packed = io.BytesIO()
-    np.savez(packed, **{name: np.ascontiguousarray(array) for name, array in arrays.items()})
+    named: dict[str, Any] = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    np.savez(packed, **named)
     data, text = packed.getvalue(), json.dumps(told).encode()
     file.write(len(text).to_bytes(8, "little") + len(data).to_bytes(8, "little") + text + data)
     file.flush()
 
 
-def _receive(file: BinaryIO) -> Contents | str:
+def _receive(file: IO[bytes]) -> Contents | str:
     def take(count: int) -> bytes:
         data = file.read(count)
         if len(data) < count:

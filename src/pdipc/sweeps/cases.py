@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pdipc.output.results import RunError, RunLockedError, open_run
+from pdipc.output.results import RunError, RunLockedError, open_run, resumable_step
 from pdipc.scene.errors import SceneError, SceneWarning
 from pdipc.scene.load import load_scene
 from pdipc.scene.worlds import refuse_worlds
@@ -83,7 +83,7 @@ def check_case(case: Case, version: str) -> list[str]:
 
 
 def run_case(case: Case, folder: str) -> int | str:
-    """Simulates, or goes on, in the case's folder below `folder`; returns the step that it began at, or what went wrong."""
+    """Simulates, or goes on, in the case's folder below `folder`; returns the step that it went on from, or what went wrong."""
     from pdipc.scene.schema import Scene
     from pdipc.simulation import run_scene
 
@@ -91,11 +91,11 @@ def run_case(case: Case, folder: str) -> int | str:
     while True:
         try:
             begun = (own / "run.json").is_file()
-            records = open_run(own).records if begun else []
+            first = resumable_step(open_run(own)) if begun else 0
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", SceneWarning)  # `check_case` has told
                 run_scene(Scene.model_validate_json(case.scene), own, resume=begun)
-            return records[-1]["step"] if records else 0
+            return first
         except RunLockedError:
             time.sleep(LOCKED_SECONDS)  # by a worker that was given up too early: it dies, or finishes
         except Exception as error:

@@ -55,7 +55,7 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=0,
-            dashboard_address=None,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]  (its default alone says that it is a str)
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # what it serves all the same, at a port that is free
             env={"PDIPC_THREADS": share},
         ) as cluster,

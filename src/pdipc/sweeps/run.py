@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pdipc.output.results import RunError, open_run
+from pdipc.scene.errors import SceneError
 from pdipc.sweeps.cases import Case, combinations, run_case
 from pdipc.sweeps.cluster import Progress, check, cluster_of, cores, each_of
 from pdipc.sweeps.table import write, write_table, write_times
@@ -45,7 +46,11 @@ def run_sweep(
     resumed: dict[int, int] = {}
     if left:
         with cluster_of(scheduler, min(workers or cores(), len(left))) as client:
-            check(client, left, tell)
+            try:
+                check(client, left, tell)
+            except (SceneError, RunError):
+                _forget(folder)
+                raise
             for number, outcome in each_of(client, "run", run_case, [(case, str(folder)) for case in left], tell):
                 if isinstance(outcome, int):
                     resumed[number] = outcome
@@ -84,6 +89,13 @@ def prepare(folder: Path, cases: list[Case], settings: dict[str, Any], resume: b
             shutil.rmtree(folder / name)
     folder.mkdir(parents=True, exist_ok=True)
     write(described, json.dumps(said) + "\n")
+
+
+def _forget(folder: Path) -> None:
+    """Leaves no trace of a sweep that was refused before any run: the next one may have the folder's name."""
+    if [entry.name for entry in folder.iterdir()] == ["sweep.json"]:
+        (folder / "sweep.json").unlink()
+        folder.rmdir()
 
 
 def is_done(folder: Path, case: Case) -> bool:

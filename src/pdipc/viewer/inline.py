@@ -46,7 +46,7 @@ LOOKS: Any = {part: {"__all__": {"name", "look"}} for part in ("bodies", "obstac
 def html_of_scene(scene: Any) -> str:
     """The start of a scene: a picture, and a table of its bodies."""
     start = Start(scene)
-    rows = [("body", "kind", "vertices", "triangles", "tets")]
+    rows: list[tuple[str, ...]] = [("body", "kind", "vertices", "triangles", "tets")]
     for body in start.assembly.bodies:
         sizes = (body.last - body.first, len(body.triangles), len(body.tets))
         rows.append((body.name, body.kind, *map(str, sizes)))

@@ -125,9 +125,14 @@ class Live:
         for handle in (self.gravity, self.friction):
             handle.on_update(lambda _: self._change())
         buttons.on_click(lambda _: engine.ask(self.step if buttons.value == "step" else self.reset))
-        self.frame.on_update(lambda event: event.client is not None and setattr(self.playing, "value", "frame"))
-        self.recording.on_update(lambda event: event.client is not None and engine.ask(self._record))
+        self.frame.on_update(self._chosen)
+        self.recording.on_update(lambda event: None if event.client is None else engine.ask(self._record))
         self._changing = False
+
+    def _chosen(self, event: Any) -> None:
+        """Somebody chose a frame: it stays."""
+        if event.client is not None:
+            self.playing.value = "frame"
 
     # --- what the page asks for; done between two steps ---
 

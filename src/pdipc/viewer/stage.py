@@ -100,7 +100,9 @@ class Stage:
         for body, (kind, look) in enumerate(zip(kinds, looks, strict=True)):
             drawn = skin(triangles[of_triangle == body], float(radii[body]))
             points, local = drawn.points(positions), drawn.triangles
-            shadows = {"side": "front"}  # the lamp sees the backs of what is closed, which then throws no shadow on itself
+            shadows: dict[str, Any] = {
+                "side": "front"
+            }  # the lamp sees the backs of what is closed, which then throws no shadow on itself
             if kind == "cloth":
                 shadows = {"side": "double", "receive_shadow": False}
             elif not closed(local):
@@ -199,7 +201,7 @@ class Stage:
             self.levels[number].visible = len(corners) > 0
             if len(corners):
                 self.levels[number].vertices = corners
-                self.levels[number].faces = np.arange(len(corners)).reshape(-1, 3)
+                self.levels[number].faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
         self.pressed = pressure is not None
 
     def close(self) -> None:

@@ -27,6 +27,8 @@ import warp as wp
 from numpy.polynomial import Chebyshev as ChebyshevSeries
 from numpy.polynomial import Polynomial
 
+from pdipc.device import language
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition
@@ -87,7 +89,7 @@ class AProducts:
         head, tail = start, start
         between = np.full((len(start), max(0, order - 1)), n, dtype=np.int32)
         value, with_bend, exact = np.ones(len(start)), np.zeros(len(start)), np.ones(len(start))
-        found = [(head, tail, between, coefficients[0] * value, coefficients[0] * exact)]
+        found: list[tuple[np.ndarray, ...]] = [(head, tail, between, coefficients[0] * value, coefficients[0] * exact)]
         for k in range(1, order + 1):
             count = degree[tail]
             paths = int(count.sum())
@@ -328,7 +330,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = shared.functions(real)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def update(
         first: int,
         inverse: wp.array(dtype=scalar),
@@ -360,7 +362,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total += term
         coefficients_out[position[e]] = constant + inverse[i] * total
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def prescribed(first: int, inverse: wp.array(dtype=scalar), x: wp.array(dtype=vec3), x_out: wp.array(dtype=vec3)):
         """x on the prescribed vertices, zero on the free ones."""
         i = first + wp.tid()
@@ -369,7 +371,7 @@ def kernels(real: Real) -> SimpleNamespace:
         else:
             x_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def right_side(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -384,7 +386,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         d_out[i] = inverse[i] * (b[i] - f.row_product(i, offsets, columns, values, x))
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def scale(
         first: int, inverse: wp.array(dtype=scalar), d: wp.array(dtype=vec3), factor: scalar, v_out: wp.array(dtype=vec3)
     ):
@@ -392,7 +394,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         v_out[i] = wp.where(inverse[i] > scalar(0.0), factor, scalar(0.0)) * d[i]
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def horner(
         first: int,
         offsets: wp.array(dtype=wp.int32),
@@ -408,7 +410,7 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         v_out[i] = factor * d[i] - inverse[i] * f.row_product(i, offsets, columns, values, v)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweep(
         first: int,
         share: int,
@@ -530,7 +532,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         _GROUPED_SWEEP.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)).replace("STAGE", str(STAGE))
     )
 
-    @wp.func_native(source.replace("SEGMENTS", str(SEGMENTS)))
+    @language.func_native(source.replace("SEGMENTS", str(SEGMENTS)))
     def group_step(
         group: int,
         lane: int,
@@ -548,7 +550,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         before: wp.array(dtype=vec3),
     ) -> scalar: ...
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def grouped_sweep(
         first: int,
         starts: wp.array(dtype=wp.int32),

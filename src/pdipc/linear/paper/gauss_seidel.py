@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.paper import jacobi
@@ -109,7 +110,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = shared.functions(real)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def residual(
         first: int,
         share: int,
@@ -133,7 +134,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 gamma += wp.dot(r, f.precondition(i, inverse, inverse_block, r))
         f.store_sum(gamma, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweep(
         first: int,
         share: int,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from pdipc.device.language import kernel
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
@@ -116,7 +117,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     f = shared.functions(real)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweep(
         first: int,
         share: int,
@@ -159,7 +160,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         f.store_sum(gamma, worker, partial_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def begin(
         first: int,
         partial: wp.array(dtype=scalar),
@@ -178,7 +179,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             f.begin_status(gamma, reference, tolerance, max_iterations, first_out, left_out, residual_out, condition_out)
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def check(
         first: int,
         partial: wp.array(dtype=scalar),

@@ -13,6 +13,9 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from pdipc.device import language
+from pdipc.device.language import kernel
+from pdipc.device.launch import BLOCK
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition
@@ -129,7 +132,7 @@ class MatrixPowers(jacobi.Chebyshev):
         matrix.setdiag(0.0)
         matrix.eliminate_zeros()
         fits = capacity_on_cuda(self.real) if self.device.is_cuda else None
-        size = group or (shared.BLOCK if self.device.is_cuda else CPU_GROUP)
+        size = group or (BLOCK if self.device.is_cuda else CPU_GROUP)
         while True:
             label = partition.groups(system.matrix, system.free, size)
             starts, vertices, ring = partition.neighbourhoods(matrix, label, order)
@@ -210,7 +213,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     module = real.module(f"{__name__}.{capacity}")
     f = shared.functions(real)
 
-    @wp.func_native(_SWEEPS.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)))
+    @language.func_native(_SWEEPS.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)))
     def group_sweeps(
         group: int,
         lane: int,
@@ -236,7 +239,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         before_out: wp.array(dtype=vec3),
     ) -> scalar: ...
 
-    @wp.kernel(module=module)
+    @kernel(module)
     def sweeps(
         first: int,
         starts: wp.array(dtype=wp.int32),

@@ -12,7 +12,7 @@ from pdipc.scene.files.contents import Contents
 READERS = {
     ".msh": volumes.msh, ".mesh": volumes.medit, ".node": volumes.tetgen, ".ele": volumes.tetgen,
     ".vtk": vtk.legacy, ".vtu": vtk.xml, ".vtp": vtk.xml, ".glb": foreign.glb,
-    ".usd": foreign.usd, ".usda": foreign.usd, ".usdc": foreign.usd,
+    ".usd": foreign.usd, ".usda": foreign.usd, ".usdc": foreign.usd, ".usdz": foreign.usd,
     ".obj": surfaces.obj, ".ply": surfaces.ply, ".stl": surfaces.stl, ".off": surfaces.off, ".npz": surfaces.npz,
 }  # fmt: skip
 

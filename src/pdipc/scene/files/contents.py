@@ -1,6 +1,8 @@
 """What a mesh file holds, as it is written, before anything is cut."""
 
+import codecs
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +35,14 @@ class Damaged(ValueError):
 def lines_left_out(count: int) -> str:
     """The note for lines between vertices, such as the sewing lines of a garment."""
     return f"{count} lines were left out; springs along them can be given as attachments with pairs"
+
+
+def text_of(path: Path) -> str:
+    """The file as text with lines that end in a line feed: UTF-8 with or without a mark, or UTF-16 with one; other bytes are replaced."""
+    data = path.read_bytes()
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = data.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def floats(words: list, width: int) -> np.ndarray:

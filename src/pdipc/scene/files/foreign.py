@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import io
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, D
 from pdipc.scene.files.volumes import is_gmsh
 
 LISTED = 10  # prims that a message names
+MESHES = ("Mesh", "TetMesh")
 
 
 def by_meshio(path: Path) -> Contents:
@@ -50,6 +52,8 @@ def by_meshio(path: Path) -> Contents:
 def glb(path: Path) -> Contents:
     import trimesh
 
+    text = _glb_head(path)
+    fans = _glb_fans(json.loads(text)) if text else 0
     scene = trimesh.load_scene(path, process=False)
     kinds = {name: type(geometry).__name__ for name, geometry in scene.geometry.items()}
     points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
@@ -66,45 +70,66 @@ def glb(path: Path) -> Contents:
             count += len(mesh.vertices)
     if others:
         notes.append(f"{len(others)} lines or clouds of points were left out")
-    head = path.read_bytes()[:20]
-    length = int.from_bytes(head[12:16], "little") if head[:4] == b"glTF" else 0
-    text = path.read_bytes()[20 : 20 + length]
-    moving = [name for name in ("skins", "animations", "targets") if f'"{name}"'.encode() in text]
+    if fans:
+        notes.append(f"{fans} fans of triangles were left out; write them as triangles")
+    moving = [name for name in ("skins", "animations", "targets", "EXT_mesh_gpu_instancing") if f'"{name}"'.encode() in text]
     if moving:
         notes.append(f"{' and '.join(moving)} were left out: the mesh is as it stands without them")
     return Contents(np.concatenate(points), [("triangle", np.concatenate(triangles))], notes=notes, repeats=True)
 
 
+GLB_MODES = {None, 0, 1, 2, 3, 4, 5}  # of what is drawn: triangles, strips of them, lines and points; not fans
+GLB_KNOWN = re.compile(
+    r"KHR_(materials|texture|lights|mesh_quantization|xmp)\w*|EXT_texture\w*"
+)  # that a file may require, as places hold without
+
+
+def _glb_head(path: Path) -> bytes:
+    """The JSON of a .glb; nothing where it is none."""
+    with open(path, "rb") as file:
+        head = file.read(20)
+        return file.read(int.from_bytes(head[12:16], "little")) if head[:4] == b"glTF" and head[16:20] == b"JSON" else b""
+
+
+def _glb_fans(tree: dict) -> int:
+    """How many primitives are fans. Raises Damaged for what trimesh would read as something else without a word: places that an extension
+    packs, that are sparse, or that are fractions of the largest whole number.
+    """
+    required = [name for name in tree.get("extensionsRequired", []) if not GLB_KNOWN.fullmatch(name)]
+    if required:
+        raise Damaged(f"it requires the extension {required[0][:60]}, which is not read; write it without")
+    accessors, fans = tree.get("accessors", []), 0
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh.get("primitives", []):
+            fans += primitive.get("mode") not in GLB_MODES
+            for which in (primitive.get("attributes", {}).get("POSITION"), primitive.get("indices")):
+                if which is None:
+                    continue
+                if "sparse" in accessors[which]:
+                    raise Damaged(f"its accessor {which} is sparse, which is not read; write it in full")
+                if accessors[which].get("normalized"):
+                    raise Damaged(f"its accessor {which} is normalized, which is not read for places; write them as float")
+    return fans
+
+
 def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
-    """All meshes of a stage, where they stand at its first time, in metres with y up; frames: at all of its times; below: only those of
+    """All meshes of a stage, where they stand at its start, in metres with y up; frames: at all of its times from then on; below: only those of
     the prim at this path and below it.
     """
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
     except ImportError as error:
         raise SceneError(f'mesh file "{path}": reading USD needs the extra: pip install "pdipc[usd]"') from error
     stage = Usd.Stage.Open(str(path))  # its prims live no longer than it does
-    first = Usd.TimeCode.EarliestTime()
-    prims, found, others, hidden = [], Contents(np.zeros((0, 3))), {}, 0
+    start = usd_start(stage)
+    first = Usd.TimeCode(start)
     root = stage.GetPseudoRoot() if below is None else _usd_prim(stage, path, below)
-    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
-        kind = str(prim.GetTypeName())
-        if not prim.IsA(UsdGeom.Gprim) and kind not in ("PointInstancer", "Skeleton"):
-            continue
-        purpose = UsdGeom.Imageable(prim).ComputePurpose()
-        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
-            hidden += 1
-            continue
-        if purpose in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):  # they stand for what is there as well
-            kind = f"{kind} of purpose {purpose}"
-        elif kind in ("Mesh", "TetMesh") and prim.GetAttribute("points").Get(first):
-            prims.append(prim)
-            continue
-        elif kind in ("Mesh", "TetMesh"):
-            kind = f"{kind} without points"
-        others[kind] = others.get(kind, 0) + 1
+    prims, others, hidden = usd_meshes(root, first)
+    found = Contents(np.zeros((0, 3)))
+    broken = _usd_broken(stage)
     if not prims:
-        raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh')
+        said = "".join(f"; {each}" for each in broken)
+        raise SceneError(f'mesh file "{path}": {"" if below is None else f"its prim {below} "}holds no Mesh{said}')
     convert, said = _units(stage)
     found.points = convert(_usd_points(prims, first))
     corners, counts, size = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
@@ -120,11 +145,12 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
             counts.append(sides)
         size += own
     found.polygons = np.concatenate(corners), np.concatenate(counts)
-    times = sorted({time for prim in prims for time in _usd_times(prim)})
+    samples = {time for prim in prims for time in _usd_times(prim)}
+    times = sorted({start, *(time for time in samples if time > start)}) if len(samples) > 1 else [start]
     if frames and len(times) > 1:
         found.frames = np.stack([convert(_usd_points(prims, Usd.TimeCode(time))) for time in times])
         found.times = np.array(times) / stage.GetTimeCodesPerSecond()
-    found.notes += said
+    found.notes += said + broken
     if others:
         listed = ", ".join(f"{number} {kind}" for kind, number in sorted(others.items()))
         found.notes.append(f"prims were left out: {listed}")
@@ -135,6 +161,45 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     return found
 
 
+def _usd_broken(stage) -> list[str]:
+    """A note where other files that the stage names are not there, or cannot be read: what they hold is not in it."""
+    errors = stage.GetCompositionErrors()
+    if not errors:
+        return []
+    return [f"{len(errors)} parts of the stage could not be put together: {' '.join(str(errors[0]).split())[:200]}"]
+
+
+def usd_start(stage) -> float:
+    """The time code that a simulation begins at: the stage's start; where it says none, its first time sample, or 0."""
+    if stage.HasAuthoredMetadata("startTimeCode"):
+        return stage.GetStartTimeCode()
+    return min((time for prim in stage.Traverse() if prim.GetTypeName() in MESHES for time in _usd_times(prim)), default=0.0)
+
+
+def usd_meshes(root, first) -> tuple[list, dict[str, int], int]:
+    """The meshes that are simulated of a prim and all below it, in their order; what else has a shape, by kind; how many prims are invisible."""
+    from pxr import Usd, UsdGeom
+
+    prims, others, hidden = [], {}, 0
+    for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
+        kind = str(prim.GetTypeName())
+        if not UsdGeom.Gprim(prim) and kind not in ("PointInstancer", "Skeleton"):
+            continue
+        purpose = UsdGeom.Imageable(prim).ComputePurpose()
+        if UsdGeom.Imageable(prim).ComputeVisibility(first) == UsdGeom.Tokens.invisible:
+            hidden += 1
+            continue
+        if purpose in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):  # they stand for what is there as well
+            kind = f"{kind} of purpose {purpose}"
+        elif kind in MESHES and prim.GetAttribute("points").Get(first):
+            prims.append(prim)
+            continue
+        elif kind in MESHES:
+            kind = f"{kind} without points"
+        others[kind] = others.get(kind, 0) + 1
+    return prims, others, hidden
+
+
 def _usd_prim(stage, path: Path, wanted: str):
     """The prim at a path. Raises SceneError, with the prims that are meshes, where there is none."""
     from pxr import Sdf
@@ -142,7 +207,7 @@ def _usd_prim(stage, path: Path, wanted: str):
     prim = stage.GetPrimAtPath(wanted) if Sdf.Path.IsValidPathString(wanted) and Sdf.Path(wanted).IsAbsolutePath() else None
     if prim:
         return prim
-    there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in ("Mesh", "TetMesh")]
+    there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in MESHES]
     near = difflib.get_close_matches(wanted, there, n=1)
     hint = f'; did you mean "{near[0]}"?' if near else ";"
     listed = ", ".join(there[:LISTED]) + (", ..." if len(there) > LISTED else "")
@@ -185,15 +250,17 @@ def _usd_faces(prim, size: int, time) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _usd_times(prim) -> list[float]:
-    """The time codes at which a prim's points or its place are given."""
+    """The time codes at which a prim's points are given; where its place is animated, whole ones, too: between keys prims turn, which points that go
+    straight do not follow.
+    """
     from pxr import UsdGeom
 
-    times = list(prim.GetAttribute("points").GetTimeSamples())
+    times, keys = list(prim.GetAttribute("points").GetTimeSamples()), []
     while prim and not prim.IsPseudoRoot():
         if prim.IsA(UsdGeom.Xformable):
-            times += UsdGeom.Xformable(prim).GetTimeSamples()
+            keys += UsdGeom.Xformable(prim).GetTimeSamples()
         prim = prim.GetParent()
-    return times
+    return [*times, *keys, *np.arange(np.ceil(min(keys)), max(keys)).tolist()] if keys else times
 
 
 def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
@@ -220,4 +287,4 @@ def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
 
 
 def _first_of(count: int) -> str:
-    return f"it moves or deforms at {count} times: it was read as it is at the first"
+    return f"it moves or deforms at {count} times: it was read as it is at the start"

@@ -9,19 +9,28 @@ from pathlib import Path
 import numpy as np
 
 from pdipc.scene.errors import SceneError
-from pdipc.scene.files.contents import Contents, Damaged, floats, lines_left_out, whole
+from pdipc.scene.files.contents import Contents, Damaged, floats, lines_left_out, text_of, whole
+from pdipc.scene.memory import free_memory, gib
+
+ARRAYS_OF_WORK = 4  # times as much memory as its arrays take to make a mesh of them
 
 
 def npz(path: Path) -> Contents:
     with zipfile.ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > 100 * path.stat().st_size + 2**30:
-        raise Damaged(f"it would unpack to {size / 2**30:.3g} GiB")
+        raise Damaged(f"it would unpack to {gib(size)}")
+    if ARRAYS_OF_WORK * size > free_memory():
+        raise SceneError(
+            f'mesh file "{path}": needs about {gib(ARRAYS_OF_WORK * size)} of memory, and {gib(free_memory())} are free'
+        )
     with np.load(path) as data:
         if "V" not in data:
             raise SceneError(f'mesh file "{path}": holds {list(data)}; needed: V and T (tets), F (triangles) or L (lines)')
         cells = [(kind, data[name]) for kind, name in (("tetra", "T"), ("triangle", "F"), ("line", "L")) if name in data]
         vertices = data["V"]
+        if vertices.dtype.kind not in "iuf":
+            raise SceneError(f'mesh file "{path}": V holds {vertices.dtype}; it must hold real numbers')
         if vertices.ndim != 3 or not len(vertices):
             return Contents(vertices, cells)
         return Contents(vertices[0], cells, frames=vertices, times=data.get("times"))
@@ -37,8 +46,8 @@ def obj(path: Path) -> Contents:
             raise Damaged(f"line {number} names vertex {found}; vertices count from 1, or back from -1")
         return found - 1 if found > 0 else len(points) + found
 
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), 1):
+    text = text_of(path).replace("\\\n", " ")
+    for number, line in enumerate(text.split("\n"), 1):
         key, *values = line.partition("#")[0].split() or [""]
         if key == "v":
             if len(values) < 3:
@@ -64,8 +73,8 @@ def obj(path: Path) -> Contents:
 
 def off(path: Path) -> Contents:
     """Object File Format, as text: a line for each vertex, which may say a normal or a colour, too, and for each face."""
-    text = re.sub(r"#[^\n]*", "", path.read_text(encoding="utf-8", errors="replace"))
-    rows = [row for row in (line.split() for line in text.splitlines()) if row]
+    text = re.sub(r"#[^\n]*", "", text_of(path))
+    rows = [row for row in (line.split() for line in text.split("\n")) if row]
     if not rows or not re.fullmatch(r"(ST)?C?N?OFF", rows[0][0]):
         raise Damaged(f'it begins with "{text.strip()[:20]}"; needed: OFF')
     if "BINARY" in rows[0]:
@@ -91,12 +100,15 @@ def stl(path: Path) -> Contents:
     if len(data) == 84 + 50 * count:
         facets = np.frombuffer(data, dtype=[("head", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")], offset=84)
         points = facets["corners"].reshape(-1, 3).astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid":
-        words = data.decode("ascii", errors="replace").split()
+    elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
+        text = data.decode("ascii", errors="replace").replace("\r", "\n")
+        named = re.sub(r"^[ \t]*(end)?solid\b[^\n]*", "", text, flags=re.IGNORECASE | re.MULTILINE)
+        words = (named if "facet" in named.lower() else text).split()  # a name may have any words in it
         at = [k for k, word in enumerate(words) if word.lower() == "vertex"]
         points = floats([words[k + 1 : k + 4] for k in at], 3)
-        if len(points) % 3:
-            raise Damaged(f"it holds {len(points)} vertices, which are no whole triangles")
+        loops = sum(word.lower() == "outer" for word in words)
+        if len(points) != 3 * loops:
+            raise Damaged(f"it holds {len(points)} vertices in {loops} loops; needed: three in each")
     else:
         raise Damaged(f"its head says {count} triangles, {84 + 50 * count} bytes, and it has {len(data)} bytes")
     return Contents(points, [("triangle", np.arange(len(points)).reshape(-1, 3))], repeats=True)
@@ -145,6 +157,8 @@ def ply(path: Path) -> Contents:
             notes.append(f"{count} strips of triangles were left out; write them as faces")
         elif name == "edge" and count:
             notes.append(lines_left_out(count))
+        elif count:
+            notes.append(f"{count} elements of the kind {name[:40]} were left out")
     return Contents(points, polygons=polygons, notes=notes)
 
 

@@ -2,11 +2,12 @@
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from pdipc.scene.errors import SceneError
-from pdipc.scene.files.contents import Contents, Damaged, floats, integers, whole
+from pdipc.scene.files.contents import Contents, Damaged, floats, integers, text_of, whole
 
 GMSH_KINDS = {  # element types of Gmsh: what they are, and their number of vertices
     1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6),
@@ -19,7 +20,7 @@ GMSH_KINDS = {  # element types of Gmsh: what they are, and their number of vert
 }  # fmt: skip
 
 
-HEAD = re.compile(rb"\s*\$MeshFormat\s+(2(?:\.\d+)?|4\.1)\s+([01])\s+(\d+)[^\n]*\n")
+HEAD = re.compile(rb"\s*\$MeshFormat\s+(2(?:\.\d+)?|4(?:\.[01])?)\s+([01])\s+(\d+)[^\n]*\n")
 
 
 def is_gmsh(path: Path) -> bool:
@@ -35,13 +36,13 @@ def is_known(path: Path) -> bool:
 
 
 def msh(path: Path) -> Contents:
-    """Gmsh, versions 2.x and 4.1, text or binary."""
+    """Gmsh, versions 2.x, 4.0 and 4.1, text or binary."""
     data = path.read_bytes()
     head = HEAD.match(data)
     if head is None:
-        raise Damaged("it does not begin with $MeshFormat of version 2 or 4.1")
+        raise Damaged("it does not begin with $MeshFormat of version 2 or 4")
     version, binary, size = head[1].decode("ascii"), head[2] == b"1", int(head[3])
-    order = "<"
+    order: Literal["<", ">"] = "<"
     if binary and int.from_bytes(data[head.end() : head.end() + 4], "little") != 1:
         order = ">"
     if binary and size not in (4, 8):
@@ -50,6 +51,8 @@ def msh(path: Path) -> Contents:
     def section(*names: str) -> tuple[str, "_Words | _Bytes"]:
         for name in names:
             begin = re.search(rb"\$" + name.encode() + rb"[ \t\r]*\n", data)
+            if begin and re.search(rb"^\$" + name.encode() + rb"[ \t\r]*\n", data[begin.end() :], re.MULTILINE):
+                raise Damaged(f"it has more than one ${name}")
             if begin:
                 end = data.find(b"$End" + name.encode(), begin.end())
                 inside = data[begin.end() : None if end < 0 or binary else end]
@@ -57,24 +60,14 @@ def msh(path: Path) -> Contents:
         raise Damaged(f"it has no ${names[0]}")
 
     (name, nodes), (_, elements) = section("Nodes", "ParametricNodes"), section("Elements")
-    if version == "4.1":
-        numbers, points = _nodes_4(nodes)
-        cells = _elements_4(elements)
+    if version.startswith("4"):
+        older = version != "4.1"
+        numbers, points = (_nodes_40 if older else _nodes_4)(nodes)
+        cells = _elements_4(elements, older)
     else:
         numbers, points = _nodes_2(nodes, parametric=name == "ParametricNodes")
         cells = _elements_2(elements)
-    sorting = np.argsort(numbers, kind="stable")
-    ascending = numbers[sorting]
-    if np.any(ascending[1:] == ascending[:-1]):
-        raise Damaged("two of its nodes have one number")
-    found = []
-    for kind, named in cells:
-        place = np.minimum(np.searchsorted(ascending, named), max(0, len(ascending) - 1))
-        known = ascending[place] == named if len(ascending) else np.zeros(named.shape, dtype=bool)
-        if not known.all():
-            raise Damaged(f"an element names node {named[~known][0]}, which is not there")
-        found.append((kind, sorting[place]))
-    return Contents(points, found)
+    return Contents(points, [(kind, _places(numbers, named, "an element")) for kind, named in cells])
 
 
 def _nodes_4(take: "_Words | _Bytes") -> tuple[np.ndarray, np.ndarray]:
@@ -88,12 +81,25 @@ def _nodes_4(take: "_Words | _Bytes") -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(numbers), np.concatenate(points)
 
 
-def _elements_4(take: "_Words | _Bytes") -> list[tuple[str, np.ndarray]]:
+def _nodes_40(take: "_Words | _Bytes") -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (n,) and points (n, 3) of Gmsh 4.0, where each node is a row of its own."""
+    numbers, points = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
+    for _ in range(take.sizes(2)[0]):
+        _, dimension, parametric = take.ints(3)
+        number, point = take.numbered(take.sizes(1)[0], dimension if parametric else 0)
+        numbers.append(number)
+        points.append(point)
+    return np.concatenate(numbers), np.concatenate(points)
+
+
+def _elements_4(take: "_Words | _Bytes", older: bool) -> list[tuple[str, np.ndarray]]:
+    """Cells of Gmsh 4.1; older: of 4.0."""
     cells = []
-    for _ in range(take.sizes(4)[0]):
+    for _ in range(take.sizes(2 if older else 4)[0]):
         kind, corners = _gmsh_kind(take.ints(3)[2])
         count = take.sizes(1)[0]
-        cells.append((kind, take.sizes(count * (1 + corners)).reshape(-1, 1 + corners)[:, 1:]))
+        rows = (take.ints if older else take.sizes)(count * (1 + corners))
+        cells.append((kind, rows.reshape(-1, 1 + corners)[:, 1:]))
     return cells
 
 
@@ -160,18 +166,21 @@ class _Words:
             raise Damaged(f"{self.name} says {count} rows of {width}")
         return floats(self.take(count * width), width) if width else np.zeros((count, 0))
 
-    def numbered(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of a number and three coordinates."""
-        words = self.take(4 * count)
-        rows = floats(words, 4)
-        return integers(words[::4]), rows[:, 1:]
+    def numbered(self, count: int, more: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of a number and three coordinates, and of `more` numbers that are left out."""
+        if not 0 <= more <= 3:
+            raise Damaged(f"{self.name} says that nodes have {more} parameters")
+        words = self.take((4 + more) * count)
+        rows = floats(words, 4 + more)
+        return integers(words[:: 4 + more]), rows[:, 1:4]
 
 
 class _Bytes:
     """What a section says as bytes, from its begin on."""
 
-    def __init__(self, data: bytes, name: str, order: str, size: str):
-        self.data, self.at, self.name, self.order, self.size = data, 0, name, order, size
+    def __init__(self, data: bytes, name: str, order: Literal["<", ">"], size: str):
+        self.data, self.at, self.name, self.size = data, 0, name, size
+        self.order: Literal["<", ">"] = order
 
     def take(self, kind: str | list, count: int) -> np.ndarray:
         dtype = np.dtype(kind).newbyteorder(self.order)
@@ -196,9 +205,11 @@ class _Bytes:
         """(count, width)."""
         return self.take("f8", int(count) * int(width)).reshape(int(count), int(width))
 
-    def numbered(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of a number and three coordinates."""
-        rows = self.take([("number", "i4"), ("point", "f8", 3)], count)
+    def numbered(self, count: int, more: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of a number and three coordinates, and of `more` numbers that are left out."""
+        if not 0 <= more <= 3:
+            raise Damaged(f"{self.name} says that nodes have {more} parameters")
+        rows = self.take([("number", "i4"), ("point", "f8", 3), ("more", "f8", (int(more),))], count)
         return rows["number"].astype(np.int64), rows["point"].astype(np.float64)
 
 
@@ -210,10 +221,13 @@ MEDIT_KINDS = {  # keywords of Medit: what they are, and their number of vertice
 }  # fmt: skip
 
 
+MEDIT_HIGHER = re.compile(r"(edges|triangles|quadrilaterals|tetrahedra|hexahedra|prisms|pyramids)[pq]\d")  # but for those above
+
+
 def medit(path: Path) -> Contents:
     """Medit's text format: keywords, each with a count and rows; white space of every kind counts alike."""
-    take = _Words(re.sub(rb"#[^\n]*", b"", path.read_bytes()), "the file")
-    dimension, points, cells = 3, None, []
+    take = _Words(re.sub(r"#[^\n]*", "", text_of(path)).encode(), "the file")
+    dimension, points, cells, notes = 3, None, [], []
     if take.take(1)[0].lower() != "meshversionformatted":
         raise Damaged(f'it begins with "{take.words[0][:20]}"; needed: MeshVersionFormatted')
     keywords = {name.lower(): kind for name, kind in MEDIT_KINDS.items()}
@@ -232,27 +246,43 @@ def medit(path: Path) -> Contents:
             kind, corners = keywords[word]
             rows = take.count()
             cells.append((kind, take.ints(rows * (corners + 1)).reshape(-1, corners + 1)[:, :corners] - 1))
+        elif MEDIT_HIGHER.fullmatch(word):
+            notes.append(f"{take.count()} cells of the kind {word} were left out")
         # what any other keyword says are numbers, which are passed over
     if points is None:
         raise Damaged("it has no Vertices")
-    return Contents(points, cells)
+    return Contents(points, cells, notes=notes)
 
 
 def tetgen(path: Path) -> Contents:
-    def rows(file: Path) -> np.ndarray:
+    def rows(file: Path) -> tuple[np.ndarray, list[str]]:
         if not file.is_file():
             raise SceneError(f'mesh file "{path}": needs "{file.name}" beside it')
-        lines = [line.split("#")[0].split() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
+        lines = [line.split("#")[0].split() for line in text_of(file).split("\n")]
         lines = [line for line in lines if line]
         count = int(lines[0][0]) if lines else 0
         if count < 1:
             raise Damaged(f'"{file.name}" says {count} rows')
         if len(lines) <= count:
             raise SceneError(f'mesh file "{file}": its first line says {count} rows, and {len(lines) - 1} are there')
-        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]])
+        return np.array([[float(x) for x in line] for line in lines[1 : count + 1]]), lines[0]
 
-    nodes, elements = rows(path.with_suffix(".node")), rows(path.with_suffix(".ele"))
+    (nodes, _), (elements, head) = rows(path.with_suffix(".node")), rows(path.with_suffix(".ele"))
     if nodes.ndim != 2 or nodes.shape[1] < 4 or elements.ndim != 2 or elements.shape[1] < 5:
         raise Damaged("its rows must be: number, x, y, z; and: number, four or ten vertices")
-    corners = 10 if elements.shape[1] >= 11 else 4
-    return Contents(nodes[:, 1:4], [("tetra", whole(elements[:, 1 : 1 + corners] - nodes[0, 0]))])
+    corners = 10 if elements.shape[1] >= 11 and head[1:2] == ["10"] else 4  # attributes may follow
+    named = whole(elements[:, 1 : 1 + corners])
+    return Contents(nodes[:, 1:4], [("tetra", _places(whole(nodes[:, 0]), named, "a tet"))])
+
+
+def _places(numbers: np.ndarray, named: np.ndarray, what: str) -> np.ndarray:
+    """Rows of the nodes that are named by their numbers. Raises Damaged for numbers that are there twice, or not at all."""
+    sorting = np.argsort(numbers, kind="stable")
+    ascending = numbers[sorting]
+    if np.any(ascending[1:] == ascending[:-1]):
+        raise Damaged("two of its nodes have one number")
+    place = np.minimum(np.searchsorted(ascending, named), max(0, len(ascending) - 1))
+    known = ascending[place] == named if len(ascending) else np.zeros(named.shape, dtype=bool)
+    if not known.all():
+        raise Damaged(f"{what} names node {named[~known][0]}, which is not there")
+    return sorting[place]

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pdipc.scene.files.contents import ORDER_AS_HEXAHEDRON, Contents, Damaged, floats, integers
+from pdipc.scene.memory import gib
 
 FIXED = {  # cells with a given number of vertices, by their number in VTK: what they are, and how many
     1: ("vertex", 1), 3: ("line", 2), 5: ("triangle", 3), 8: ("pixel", 4), 9: ("quad", 4), 10: ("tetra", 4), 11: ("voxel", 8),
@@ -67,9 +68,10 @@ def _sort(found: Contents, kinds: np.ndarray, corners: np.ndarray, ends: np.ndar
             elif kind != 0:
                 found.notes.append(f"{len(rows)} cells of VTK's kind {kind} were left out")
     if polygons:
-        found.polygons = tuple(
+        corners, counts = (
             np.concatenate([old, *new]) for old, new in zip(found.polygons, zip(*polygons, strict=True), strict=True)
         )
+        found.polygons = corners, counts
 
 
 # --- legacy ---
@@ -258,6 +260,8 @@ class _Xml:
         taken = (3 + blocks) * width
         taken = taken if plain else -(-taken // 3) * 4
         content = data[taken : taken + sum(packed)] if plain else self.decoded(data[taken:], sum(packed))
+        if (blocks - 1) * size + (rest or size) > 100 * len(data) + 2**30:
+            raise Damaged(f"a DataArray would unpack to {gib(blocks * size)}")
         parts, at = [], 0
         for number, length in enumerate(packed):
             whole = rest if number == blocks - 1 and rest else size
