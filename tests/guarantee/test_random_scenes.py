@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from physics.scenes import cloth, floor, scene, solid, watched
 
 import pdipc
+from pdipc.drive import step
 from pdipc.judge.certify import certify
 from pdipc.output.results import open_run
 from pdipc.simulation import run_scene
@@ -18,6 +19,7 @@ from pdipc.simulation import run_scene
 STEPS = 3
 PARTS, OF_A_PART = 8, 25  # random scenes
 UNCONVERGED = 4  # steps of the 75 of a part, at most
+OF_TRUE = 30  # scenes whose steps are solved again
 CUT, OF_CUT = 2, 20  # outer iterations after which steps are cut short, and scenes
 
 coordinate = st.floats(-0.3, 0.3)
@@ -98,6 +100,35 @@ def test_steps_converge_and_nothing_intersects_at_any_outer_iteration(part):
     capped = [result.message for result in results if not result.converged]
     assert len(capped) <= UNCONVERGED
     assert all("outer iterations ended the step" in message for message in capped)
+
+
+def test_steps_that_converge_are_solved():
+    """Each is as near to the same step at a thousandth of the tolerance as "converged" says: three tolerances."""
+    errors = []
+
+    @examples(OF_TRUE, PARTS + 1)
+    @given(scenes())
+    def compares(random_scene):
+        random_scene.contact.method, random_scene.contact.restitution = "barrier", None
+        strict = random_scene.model_copy(deep=True)
+        try:
+            coarse = pdipc.Simulation(random_scene, "cpu")
+        except pdipc.SceneError:
+            assume(False)
+        tolerance = coarse.model.settings.tolerance
+        strict.simulation.tolerance, strict.simulation.max_outer = 1e-3 * tolerance / strict.simulation.time_step, 1000
+        fine = pdipc.Simulation(strict, "cpu")
+        for _ in range(STEPS):
+            state = coarse.model.state_from(coarse.state.arrays())
+            ends = [step(each.model, state, each.work) for each in (coarse, fine)]
+            if all(end.converged and end.lag == 0.0 for end in ends):
+                moved = np.subtract(*(end.state.positions.numpy() for end in ends))
+                errors.append(float(np.linalg.norm(moved, axis=1).max() / tolerance))
+            coarse.step()
+
+    compares()
+    assert len(errors) > 2 * OF_TRUE
+    assert max(errors) <= 3.0
 
 
 def test_nothing_intersects_where_steps_are_cut_short():

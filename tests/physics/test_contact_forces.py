@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import pdipc
-from pdipc.integration import status
 from pdipc.output.forces import ContactForces
 
 from .scenes import floor, scene, solid
@@ -219,22 +218,33 @@ def test_friction_is_bounded_by_the_normal_forces_that_a_step_ends_with():
     assert touched >= 2
 
 
-def test_friction_knows_what_contacts_push_with_where_a_step_starts():
-    """Whatever the step before has left: a run that is taken up again has nothing of it."""
-    simulation = pdipc.Simulation(scene([block()], [floor()], contact={"friction": 0.5, **NEAR}), "cpu")
-    for _ in range(5):
+def test_friction_rubs_with_the_normal_forces_of_where_a_step_starts():
+    """As incremental potential contact has it, so that a step is one minimum. A block lands while it slides: whatever it is pushed with
+    at the end of a step rubs in the next one, and nothing of an earlier one is left.
+    """
+    sliding = block(at=(0.0, 0.11, 0.0), velocity=(3.0, -0.5, 0.0))
+    simulation = pdipc.Simulation(scene([sliding], [floor(20.0)], contact={"friction": 0.3, **NEAR}), "cpu")
+    pushed, hardest = 0.0, 0.0
+    for _ in range(12):
+        result = simulation.step(forces=True)
+        on = result.forces.on("block")
+        assert result.converged
+        assert on.friction[0] == pytest.approx(-0.3 * pushed, rel=1e-3, abs=1e-6)
+        pushed = on.normal[1]
+        hardest = max(hardest, pushed)
+    assert hardest > 3.0 * 8.0 * G  # it came down, and did not only rest
+
+
+def test_bodies_that_rub_and_part_descend_together():
+    """Friction of where a step starts is one potential of both bodies, however far they are from each other when it ends."""
+    low, high = block("low"), block("high", at=(0.0, 0.3025, 0.0))
+    made = scene([low, high], [floor(20.0)], contact={"friction": 0.5, **NEAR})
+    simulation = pdipc.Simulation(made, "cpu")
+    for _ in range(4):
         simulation.step()
-    method = simulation.work.method
-    simulation.work.recorded = False
-    freeze, taken = method.freeze, []
-
-    def noted():
-        forces = np.linalg.norm(method.pairs.force_of_vertex.numpy(), axis=1)
-        freeze()
-        taken.append((method.numbers.numpy()[status.PUSH_TAKEN], forces.max()))
-
-    method.freeze = noted
-    method.numbers.fill_(1e30)
-    simulation.step()
-    assert taken[0][1] > 1.0
-    assert taken[0][0] == pytest.approx(taken[0][1])
+    simulation.set_velocities("high", (5.0, 20.0, 0.0))
+    result = simulation.step(forces=True)
+    assert result.converged
+    assert result.forces.on("high", "low").friction[0] < -1.0
+    assert result.forces.on("high", "low").normal[1] == 0.0  # they are apart
+    assert set(simulation.work.method.islands.label.numpy()[:2]) == {0}

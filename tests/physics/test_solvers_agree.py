@@ -11,12 +11,12 @@ from .scenes import floor, scene, solid, watched
 CONTACT = {"activation_distance": 2e-3, "minimum_separation": 1e-4, "friction": 0.3}
 
 
-def run(steps=12, threads=None, monkeypatch=None, model="auto", **simulation):
+def run(steps=12, threads=None, monkeypatch=None, model="auto", friction=0.3, **simulation):
     if threads is not None:
         monkeypatch.setenv("PDIPC_THREADS", str(threads))
     body = solid("block", (0.2, 0.2, 0.2), (3, 3, 3), at=(0, 0.125, 0), rotation=(5, 0, 8), velocity=(0, -1, 0))
     body["material"]["model"] = model
-    made = watched(scene([body], [floor()], contact=CONTACT, **simulation))
+    made = watched(scene([body], [floor()], contact=CONTACT | {"friction": friction}, **simulation))
     for _ in range(steps):
         assert made.step().converged
     return made.positions
@@ -24,13 +24,14 @@ def run(steps=12, threads=None, monkeypatch=None, model="auto", **simulation):
 
 @pytest.mark.parametrize("solver", ["pcg", "jacobi", "chebyshev", "matrix-powers", "gauss-seidel", "sor", "direct"])
 def test_solvers_agree(solver):
-    exact = {"tolerance": 1e-5, "max_outer": 500}
+    """Without friction, whose normal forces local-global iterations take from the iterate, and Newton's method from where a step starts."""
+    exact = {"tolerance": 1e-5, "max_outer": 500, "friction": 0.0}
     part = {"nonlinear_solver": "local-global", "linear_iterations": 100}
     np.testing.assert_allclose(run(linear_solver=solver, **part, **exact), run(model="arap", **exact), atol=2e-5)
 
 
 def test_precisions_agree():
-    np.testing.assert_allclose(run(precision="float32", tolerance=1e-4), run(precision="float64", tolerance=1e-4), atol=2e-4)
+    np.testing.assert_allclose(run(precision="float32", tolerance=3e-4), run(precision="float64", tolerance=3e-4), atol=2e-4)
 
 
 def test_threads_give_the_same_bits(monkeypatch):

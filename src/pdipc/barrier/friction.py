@@ -2,7 +2,7 @@
 
     D = sum mu lambda f0(|u|),   u = (I - n n^T) sum_i a_i u_i,   f0' = f1,   f1 = 2 y - y^2 for y = |u| / (eps_v h) < 1, else 1
 
-u_i is the displacement of a vertex since the start of the step. lambda, a and n are those of the barrier at the positions that were last copied.
+u_i is the displacement of a vertex since the start of the step. lambda, a and n are those of the barrier where the step starts.
 """
 
 import functools

@@ -380,7 +380,7 @@ class Newton(Descent):
         return [each for each in (self.pairs, self.friction, *beside) if each is not None]
 
     def freeze(self) -> None:
-        """Line 5: barriers and their derivatives are those at x since x was accepted; friction takes over their forces."""
+        """Line 5: barriers and their derivatives are those at x since x was accepted; friction has those of where the step started."""
         w = self.work
         self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
