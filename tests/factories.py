@@ -49,7 +49,6 @@ STEP = {
     "wide couplings": lambda precision: {"a": exact.wide_coupling(precision), "b": friction.wide_coupling(precision)},
     "wide pcg": lambda precision: wide_pcg.kernels(precision, exact.operator(precision), friction.operator(precision)),
     "affine": affine.kernels,
-    "flags": lambda precision: {"taking over": newton._taking_over(precision)},
     "forces": forces.kernels,
     "reductions": lambda precision: parallel.kernels(precision),
     "scan": lambda _: parallel.scan_kernels(),
