@@ -21,7 +21,8 @@ import warp as wp
 from simulation import machine
 
 from pdipc.constraints import rotation
-from pdipc.device.precision import kernel, real
+from pdipc.device.language import kernel
+from pdipc.device.precision import real
 
 
 def rotations(random: np.random.Generator, count: int) -> np.ndarray:

@@ -200,6 +200,17 @@ def test_certify_prints_the_verdict(folder):
     assert (told["segments"], told["hits"]) == ("3", "0")
 
 
+def test_names_of_all_kinds_are_printed_in_terminals_that_know_few(tmp_path):
+    """As that of a job or of a container may be."""
+    body = '[[bodies]]\nname = "Stoff \\u00e4 \\U0001f600"\nkind = "cloth"\nmesh = { shape = "grid" }\nscale = -1\n'
+    (tmp_path / "a.toml").write_text(body)
+    environment = {**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONUTF8": "0"}
+    command = [sys.executable, "-m", "pdipc", "check-scene", str(tmp_path / "a.toml")]
+    result = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert result.returncode == 2, result.stderr
+    assert b"Stoff \xe4 \\U0001f600" in result.stdout
+
+
 def test_check_scene_lists_everything(scene):
     assert runner.invoke(app, ["check-scene", str(scene)]).exit_code == 0
     data = runs.scene()

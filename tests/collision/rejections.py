@@ -13,8 +13,9 @@ import warp as wp
 
 from collision import exact
 from pdipc.collision import broad_phase, candidates, ccd, moving_boxes, sieve, surface
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
-from pdipc.device.precision import kernel, real
+from pdipc.device.precision import real
 from pdipc.judge import witness
 
 KINDS = ("vertex_triangle", "edge_edge")

@@ -7,8 +7,9 @@ import warp as wp
 from collision.test_broad_phase import METHODS, sheet
 from pdipc.collision import broad_phase, distance, surface
 from pdipc.collision.candidates import Candidates
+from pdipc.device.language import kernel
 from pdipc.device.launch import Device
-from pdipc.device.precision import kernel, real
+from pdipc.device.precision import real
 from pdipc.scene import generators
 
 D_HAT, MARGIN, HALF = 0.01, 0.004, 0.001  # m

@@ -3,6 +3,7 @@
 import datetime
 import os
 import re
+import time
 
 import numpy as np
 import pytest
@@ -101,6 +102,46 @@ def test_json_nested_too_deep_and_of_another_kind(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "symlink"), reason="no links here")
+@pytest.mark.parametrize("table", ['"name": "\\ud800"', '"name": "c", "mesh": "\\ud800.obj"', '"name": "c", "\\udfff": 1'])
+def test_json_with_half_a_character(tmp_path, table):
+    """Which cannot be printed; whole ones written by halves can be."""
+    told = refused(tmp_path, '{"bodies": [{"kind": "cloth", "mesh": {"shape": "grid"}, ' + table + "}]}", "a.json")
+    assert re.search(r"is not valid JSON: .*surrogates not allowed", told), told
+    text = '{"bodies": [{"kind": "cloth", "mesh": {"shape": "grid"}, "name": "\\ud83d\\ude00"}]}'
+    (tmp_path / "a.json").write_text(text)
+    assert load.load_scene(tmp_path / "a.json").bodies[0].name == "\U0001f600"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "a." * 100_000 + "b = 1",
+        '"a" . ' * 100_000 + "b = 1",
+        "[" + "a." * 100_000 + "b]",
+        "c = {" + "'a'." * 100_000 + "b = 1}",
+    ],
+)
+def test_keys_of_very_many_names(tmp_path, key):
+    """Python's reader takes hours for these."""
+    begun = time.process_time()
+    assert "nested too deep" in refused(tmp_path, f"{BALL}\n{key}\n")
+    assert time.process_time() - begun < 20.0
+
+
+def test_texts_full_of_words_and_quotes_are_looked_through_in_time():
+    begun = time.process_time()
+    for text in (
+        "x" * 1_000_000,
+        'x "' * 500_000,
+        "0.5, " * 300_000,
+        "a.b.c " * 200_000,
+        '"' * 1_000_000,
+        ("a." * 99 + "\n") * 5_000,
+    ):
+        assert load.DOTTED.search(text) is None
+    assert time.process_time() - begun < 5.0
+
+
 def test_links_in_circles_and_paths_too_long(tmp_path):
     for a, b in (("a.toml", "b.toml"), ("b.toml", "a.toml"), ("a.obj", "b.obj"), ("b.obj", "a.obj")):
         (tmp_path / a).symlink_to(tmp_path / b)

@@ -112,37 +112,38 @@ class Cluster:
             process.wait(timeout=120)
 
 
-def kill_a_worker(folder, killed: list):
-    """Once a run has three frames, ends the process that writes it, which run.lock names, at once."""
-    while not killed:
+def kill_workers(folder, killed: list, deaths: int):
+    """Ends so many times, once a run has three frames, the process that writes it, which run.lock names, at once."""
+    while len(killed) < deaths:
         for lock in folder.glob("*/run.lock"):
             words = re.match(r"process (\d+) on", lock.read_text())
-            if words and len(list(lock.parent.glob("frames/*.npy"))) > 3:
+            alive = words and int(words[1]) not in [process for process, _ in killed]
+            if words and alive and 3 < len(list(lock.parent.glob("frames/*.npy"))) < 8:
                 os.kill(int(words[1]), signal.SIGKILL)
                 killed.append((int(words[1]), lock.parent.name))
-                return
+                break
         time.sleep(0.02)
 
 
-def test_a_killed_worker_is_replaced_and_its_run_goes_on(scene, tmp_path):
+def test_killed_workers_are_replaced_and_their_runs_go_on(scene, tmp_path):
     expected = serially(scene, SETTINGS, tmp_path / "serial")
     killed: list = []
     (tmp_path / "cluster").mkdir()
     with Cluster(tmp_path / "cluster") as cluster:
-        killer = threading.Thread(target=kill_a_worker, args=(tmp_path / "swept", killed), daemon=True)
+        killer = threading.Thread(target=kill_workers, args=(tmp_path / "swept", killed, 2), daemon=True)
         killer.start()
         failures = sweeps.run_sweep(scene, SETTINGS, tmp_path / "swept", scheduler=cluster.address)
         killer.join(timeout=120)
         with distributed.Client(cluster.address) as client:
-            client.wait_for_workers(2, timeout=120)  # the dead one has a successor
+            client.wait_for_workers(2, timeout=120)  # the dead ones have successors
             processes = set(client.run(os.getpid).values())
-    assert failures == {} and len(killed) == 1
-    process, run = killed[0]
-    assert process not in processes
+    assert failures == {} and len(killed) == 2
+    assert not processes & {process for process, _ in killed}
     assert (tmp_path / "swept" / "table.csv").read_bytes() == expected
     resumed = {row["run"]: int(row["resumed_at_step"]) for row in rows(tmp_path / "swept", "times.csv")}
-    assert resumed[run] >= 2, "the run went on from a checkpoint"
-    assert [step for name, step in resumed.items() if name != run] == [0, 0, 0]
+    whose = {run for _, run in killed}
+    assert all(resumed[run] >= 2 for run in whose), "they went on from a checkpoint"
+    assert not any(step for name, step in resumed.items() if name not in whose)
     table = rows(tmp_path / "swept")
     assert [row["run"] for row in table] == ["0000", "0001", "0002", "0003"]
     assert len({row["positions_sha256"] for row in table}) == 4
@@ -270,3 +271,21 @@ def test_the_page(tmp_path, monkeypatch):
     for line, row in zip(shown.splitlines()[1:], table, strict=True):
         for cell, value in zip(line.split(","), row, strict=True):
             assert cell == value or float(cell) == pytest.approx(float(value), rel=0.05)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGINT to send")
+def test_an_interrupt_stops_a_sweep_and_resume_finishes_it(scene, tmp_path):
+    """Ctrl-C while runs are under way on processes of this machine: one message, no table; then the table of a serial sweep."""
+    scene.write_text(SCENE.replace("steps = 8", "steps = 300"))
+    settings = {"contact.friction": [0.0, 0.5]}
+    command = [sys.executable, "-m", "pdipc", "sweep", str(scene), "--set", "contact.friction=0.0,0.5", "--workers", "2"]
+    command += ["-o", str(tmp_path / "swept")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "PDIPC_THREADS": "1"})
+    while process.poll() is None and not list(tmp_path.glob("swept/*/frames/000020.npy")):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode == 130 and "with --resume" in said and "Traceback" not in said
+    assert not (tmp_path / "swept" / "table.csv").exists()
+    assert subprocess.run([*command, "--resume"], capture_output=True, timeout=300).returncode == 0
+    assert (tmp_path / "swept" / "table.csv").read_bytes() == serially(scene, settings, tmp_path / "serial")

@@ -1,6 +1,7 @@
 """What all commands share: the application, how errors are told, and the arguments that scenes and runs are named by."""
 
 import functools
+import io
 import os
 import sys
 import warnings
@@ -93,6 +94,9 @@ def command(*args: Any, **kwargs: Any) -> Callable[[Callable], Callable]:
             from pdipc.output.results import RunError
             from pdipc.scene.errors import SceneError
 
+            for stream in (sys.stdout, sys.stderr):
+                if isinstance(stream, io.TextIOWrapper):
+                    stream.reconfigure(errors="backslashreplace")  # any name can be printed in any terminal
             try:
                 with warnings.catch_warnings():
                     warnings.showwarning = _tell

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,10 @@ from pdipc.scene.vary import put
 BUNDLED = Path(__file__).parent.parent / "scenes"
 BYTES_PER_BYTE = 30  # of memory for a scene file: what its numbers take as Python's
 LISTS = ("bodies", "obstacles", "attachments", "stitches", "forces")
+HALF_A_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
+DOTTED = re.compile(
+    r"""(?<![\w.'"-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}"""
+)  # a key of a hundred names and more
 NOBODY = "nobody, in place of bodies that are wrong"
 
 
@@ -99,7 +104,16 @@ def _tables(path: str | Path) -> tuple[Path, dict[str, Any]]:
                 f'"{file}": needs about {gib(needed)} of memory, and {gib(free)} are free; put meshes in .npz files'
             )
         text = file.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
-        data = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+        if file.suffix == ".json":
+            data = json.loads(text)
+            if HALF_A_CHARACTER.search(text):
+                json.dumps(
+                    data, ensure_ascii=False
+                ).encode()  # raises where one stands alone: that could not be printed or written
+        else:
+            if DOTTED.search(text):  # the time that these take grows with the square of their number
+                raise RecursionError
+            data = tomllib.loads(text)
     except RecursionError as error:
         raise SceneError(f'"{file}": is not valid {kind}: its tables or lists are nested too deep') from error
     except SceneError:

@@ -49,22 +49,26 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
         return
     share, log = str(max(1, cores() // workers)), logging.getLogger("distributed.nanny")
     level = log.level
-    with (
-        # without a limit of memory: Dask would end a worker for using more than an even share
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            memory_limit=0,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]  (its default alone says that it is a str)
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # what it serves all the same, at a port that is free
-            env={"PDIPC_THREADS": share},
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
-        # all is done: that a busy machine is slow to end the workers is nothing to warn of
-        log.setLevel(logging.ERROR)
-    log.setLevel(level)
+    try:
+        with (
+            # without a limit of memory: Dask would end a worker for using more than an even share
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=0,
+                dashboard_address=None,  # pyright: ignore[reportArgumentType]  (its default alone says that it is a str)
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # what it serves all the same, at a port that is free
+                env={"PDIPC_THREADS": share},
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+            try:
+                yield client
+            finally:
+                # all is done, or stopped: that a busy machine is slow to end the workers is nothing to warn of
+                log.setLevel(logging.ERROR)
+    finally:
+        log.setLevel(level)
 
 
 def each_of(
