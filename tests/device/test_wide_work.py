@@ -21,7 +21,7 @@ from pdipc.work import Work
 # Kernels of one thread over what does not grow with meshes: simulated bodies, of which 512 are told apart, and what is scripted.
 OVER_BODIES = {"judge", "label", "restrain", "spread_least", "start"}
 OVER_MOVERS = {"advance"}
-LAUNCHES = 63  # of an outer iteration in which nothing happens, beside its linear system; 30 would be good
+LAUNCHES = 64  # of an outer iteration in which nothing happens, beside its linear system; 30 would be good
 STRIDES = ("block_dim", "step", "stride", "shares", "size")  # loops with such a step are shared by many threads
 
 

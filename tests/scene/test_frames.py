@@ -125,7 +125,7 @@ def test_time_samples_of_usd(tmp_path):
         ({"V": FRAMES[:, :-1], "times": TIMES}, "the cache has frames of 48 vertices; its mesh has 49"),
         ({"V": FRAMES[0]}, "holds one frame only; needed: several"),
         ({"W": FRAMES}, "needed: V and T (tets), F (triangles) or L (lines)"),
-        ({"V": FRAMES.astype(complex), "times": TIMES}, "they must be numbers (frames, n, 3)"),
+        ({"V": FRAMES.astype(complex), "times": TIMES}, "V holds complex128; it must hold real numbers"),
         (None, "there is no such file"),
     ],
 )

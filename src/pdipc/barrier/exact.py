@@ -21,7 +21,7 @@ from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
 from pdipc.device.language import Kernel, func, kernel, struct_of
-from pdipc.device.launch import Largest, Span
+from pdipc.device.launch import Span
 from pdipc.device.precision import Real
 from pdipc.linear import contact_rows
 from pdipc.linear.contact_rows import ContactRows, first_entry
@@ -211,7 +211,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 hessian_out[k] = hessian
 
     @kernel(module)
-    def measure_bend(
+    def measure_change(
         first: int,
         count: wp.array(dtype=wp.int32),
         p: wp.array(dtype=vec3),
@@ -394,7 +394,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         differentiate=differentiate,
-        measure_bend=measure_bend,
+        measure_change=measure_change,
         gather=gather,
         stretch=stretch,
         spread=spread,
@@ -431,15 +431,13 @@ class BarrierTerm(ActivePairs):
         self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
         self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.kappa), capacity)
         self.change = wp.zeros(capacity, dtype=real.scalar, device=device)
-        self.largest_change = Largest(self.device, real, [capacity])
 
-    def measure_change(self, p: wp.array, held: wp.array, numbers: wp.array, slot: int) -> None:
-        """Launches numbers[slot]: by how much the motion p would change the curvature of a frozen pair at most, as part of that, or of the
-        inertia that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
+    def measure_change(self, p: wp.array, held: wp.array) -> None:
+        """Launches `change`: by how much the motion p would change the curvature of each frozen pair, as part of that, or of the inertia
+        that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
         """
         inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, held]
-        self.device.launch(self.exact.measure_bend, self.capacity, [*inputs, self.change], grain=4)
-        self.largest_change.find([self.change], numbers, [slot])
+        self.device.launch(self.exact.measure_change, self.capacity, [*inputs, self.change], grain=4)
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""

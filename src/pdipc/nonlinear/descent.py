@@ -545,7 +545,7 @@ class Descent:
         self.attempts, self.searching, self.hits, self.project, self.restrained, self.lowered = flags
         self.restraint = zeros(scalar, self.bodies)
         self.pairs.project = self.project
-        self.largest = Largest(device, real, [n])
+        self._make_room()
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -558,9 +558,15 @@ class Descent:
     def grow(self) -> bool:
         """Makes room where a list was full."""
         grown = self.pairs.grow()
-        if grown and self.friction is not None:
-            self.friction.grow()
+        if grown:
+            self._make_room()
+            if self.friction is not None:
+                self.friction.grow()
         return grown
+
+    def _make_room(self) -> None:
+        counts = [self.model.vertex_count, self.pairs.capacity]
+        self.largest = Largest(self.device, self.model.real, counts)
 
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
@@ -658,7 +664,7 @@ class Descent:
         device.loop(self.searching, search)
         inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
-        self.largest.find([self.lags], self.numbers, [status.LAG])
+        self.largest.find([self.lags, self.pairs.change], self.numbers, [status.LAG, status.BARRIER_CHANGE])
         self._keep_energies()
         if w.script.moves:
             self._find_crowded()

@@ -419,7 +419,7 @@ class Newton(Descent):
         device.launch(k.measure, n, [self.p, model.free, self.rhs, self.inertial, self.moved, self.forces, self.scales])
         wanted = [self.moved, self.forces, self.scales]
         self.largest_of_three.find(wanted, self.numbers, [status.MOVED, status.FORCE, status.FORCE_SCALE])
-        self.pairs.measure_change(self.p, self.matrix.held, self.numbers, status.BARRIER_CHANGE)
+        self.pairs.measure_change(self.p, self.matrix.held)
         states = [self.project, self.hits, self.attempts, w.count]
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
         if self.bodies:
