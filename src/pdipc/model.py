@@ -1,6 +1,7 @@
 """The model: what stays constant during a simulation, assembled once from a scene; and the state that a step changes."""
 
 import functools
+import os
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,6 +29,7 @@ from pdipc.scene.errors import SceneWarning
 from pdipc.scene.schema import Scene, uses_newton
 from pdipc.scene.worlds import refuse_worlds
 
+ALONE = 400  # vertices of a model that one thread steps: two would lose more in waiting for each other than they win, on a busy machine most
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
 # The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
@@ -220,13 +222,18 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     refuse_worlds(scene, "a model")
     assembly.masses = masses
     sim = scene.simulation
-    place = device if isinstance(device, Device) else Device(device or sim.device)
+    place = device if isinstance(device, Device) else Device(device or sim.device, threads_for(len(assembly.positions)))
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
     told = len(assembly.notes)
     refuse(scene, assembly, number.name)
     for note in assembly.notes[told:]:
         warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene.settled(), assembly, place, number)
+
+
+def threads_for(vertices: int) -> int | None:
+    """CPU threads of a model of so many vertices; None for as many as there may be, which PDIPC_THREADS always says by itself."""
+    return 1 if vertices <= ALONE and not os.environ.get("PDIPC_THREADS", "").strip() else None
 
 
 def reassembled(model: Model, assembly: Assembly) -> Model:

@@ -204,3 +204,16 @@ def test_importing_and_counting_needs_no_linux():
     )
     counting = {name: value for name, value in os.environ.items() if name != "PDIPC_THREADS"}
     subprocess.run([sys.executable, "-c", code], check=True, env=counting)
+
+
+def test_small_models_have_one_thread(monkeypatch):
+    """Unless the environment says how many."""
+    small, large = (
+        {"bodies": [{"name": "sheet", "kind": "cloth", "mesh": {"shape": "grid", "size": [1, 1], "cells": [n, n]}}]}
+        for n in (4, 24)
+    )
+    monkeypatch.delenv("PDIPC_THREADS", raising=False)
+    monkeypatch.setattr(threads, "thread_count", lambda: 3)
+    assert [pdipc.build(pdipc.Scene(**each), "cpu").device.threads for each in (small, large)] == [1, 3]
+    monkeypatch.setenv("PDIPC_THREADS", "3")
+    assert pdipc.build(pdipc.Scene(**small), "cpu").device.threads == 3
