@@ -16,6 +16,8 @@ COUNTS = 9
 # `numbers`, in the scene's precision: the largest motion that the last outer iteration wanted, m; the largest force that is left, N, and
 # the largest force of inertia, to compare it with; how far something scripted is behind, m; the motion that the iteration before wanted, and
 # the one that last wanted it while nothing was held back, m; by what part the last motion
-# wanted would change the curvature of a barrier, at most
-MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY, BARRIER_CHANGE = (wp.constant(place) for place in range(7))
-NUMBERS = 7
+# wanted would change the curvature of a barrier, at most; how far forces that are not balanced would move a body as a whole, m
+MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY, BARRIER_CHANGE, UNBALANCED = (
+    wp.constant(place) for place in range(8)
+)
+NUMBERS = 8

@@ -46,6 +46,12 @@ BARRIER_CHANGE = (
 FORCE_CHANGE = (
     0.1  # the same where there is friction, which the next step takes over: what pairs push with is then true to a hundredth
 )
+TIES = (
+    "point_attachment",
+    "axis_attachment",
+    "surface_attachment",
+    "stitch",
+)  # kinds of elements whose forces act on a body from outside
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -88,6 +94,7 @@ def kernels(real: Real) -> SimpleNamespace:
     wide = wp.float64
     slack = wp.constant(wp.float64(SLACK[real.name]))
     least_number = blocks.least(scalar)
+    total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
 
     @kernel(module)
     def inertia(
@@ -317,6 +324,62 @@ def kernels(real: Real) -> SimpleNamespace:
                     crowded_out[mover[i]] = 1
 
     @kernel(module)
+    def weigh(
+        first: int,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        whole: wp.array(dtype=wp.int32),
+        mass: wp.array(dtype=scalar),
+        base: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        inertial: wp.array(dtype=vec3),
+        barrier: wp.array(dtype=vec3),
+        h: scalar,
+        left_out: wp.array(dtype=scalar),
+    ):
+        """How far what is left of forces and torques on each body would move it, against its inertia: within the body they cancel."""
+        worker = first + wp.tid()
+        b = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        start = starts[b]
+        end = ends[b]
+        if whole[b] == 0:
+            end = start
+        origin = base[start]
+        total = wide(0.0)
+        center = wp.vec3d()
+        force = wp.vec3d()
+        for i in range(start + lane, end, wp.block_dim()):
+            m = wide(mass[i])
+            total += m
+            center += m * widened((base[i] - origin) + u[i])
+            force += widened(inertial[i] + barrier[i])
+        total = total_number(total)
+        center = total_vector(center)
+        force = total_vector(force)
+        if total > wide(0.0):
+            center = center / total
+        square = wide(0.0)
+        outer = wp.mat33d()
+        torque = wp.vec3d()
+        for i in range(start + lane, end, wp.block_dim()):
+            m = wide(mass[i])
+            arm = widened((base[i] - origin) + u[i]) - center
+            square += m * wp.length_sq(arm)
+            outer += m * wp.outer(arm, arm)
+            torque += wp.cross(arm, widened(inertial[i] + barrier[i]))
+        square = total_number(square)
+        outer = total_matrix(outer)
+        torque = total_vector(torque)
+        if lane == 0:
+            left = wide(0.0)
+            if total > wide(0.0) and square > wide(0.0):
+                # a little more than the inertia, for bodies on a line
+                turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * torque
+                left = wide(h) * wide(h) * (wp.length(force) / total + wp.sqrt(square / total) * wp.length(turn))
+            left_out[b] = scalar(left)
+
+    @kernel(module)
     def clear(first: int, flags_out: wp.array(dtype=wp.int32)):
         flags_out[first + wp.tid()] = 0
 
@@ -382,7 +445,7 @@ def kernels(real: Real) -> SimpleNamespace:
         ratio = scalar(0.99)
         if count[status.OUTER] > 0:
             ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
-        left = residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio))
+        left = wp.max(residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio)), numbers[status.UNBALANCED])
         numbers[status.MOVED_BEFORE] = residual
         if overflow[0] != 0:
             code = status.OVERFLOW
@@ -501,11 +564,12 @@ class Descent:
     """What the methods of the default mode share: the potential, the line search and the end of a step.
 
     p: (n + 1,) vec3, m, the motion that an iteration wants. numbers: on the device, see `status`: the largest such motion, m; forces, N; lag, m.
-    descends: whether a motion has to lower the potential. frictional: whether friction is part of it.
+    descends: whether a motion has to lower the potential. frictional: whether friction is part of it. weighs: whether a step has also to leave no
+    force that would move a body as a whole: for methods whose motions say little of how much is left, such as local-global iterations of stiff bodies.
     """
 
     # Long: all that lives as long as the solve is made here.
-    def __init__(self, work, frictional: bool = True, descends: bool = True):
+    def __init__(self, work, frictional: bool = True, descends: bool = True, weighs: bool = False):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count
         self.work, self.model, self.device, self.descending = work, model, device, kernels(real)
@@ -546,6 +610,12 @@ class Descent:
         self.restraint = zeros(scalar, self.bodies)
         self.pairs.project = self.project
         self._make_room()
+        tied = {int(owner[v]) for s in model.projector.sets if s.kind in TIES for v in s.vertices.ravel()}
+        whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
+        self.weighs = weighs and any(whole)
+        self.balanced = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
+        self.unbalanced = zeros(scalar, self.bodies)
+        self.largest_of_bodies = Largest(device, real, [max(1, self.bodies)])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -666,6 +736,21 @@ class Descent:
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
         self.largest.find([self.lags, self.pairs.change], self.numbers, [status.LAG, status.BARRIER_CHANGE])
         self._keep_energies()
+        if self.weighs:
+            inputs = [
+                self.starts,
+                self.ends,
+                self.balanced,
+                model.mass,
+                w.x_start,
+                w.u,
+                self.inertial,
+                self.pairs.force_of_vertex,
+            ]
+            device.launch_blocks(
+                k.weigh, self.bodies, [*inputs, model.real.scalar(model.settings.time_step), self.unbalanced], grain=1000
+            )
+            self.largest_of_bodies.find([self.unbalanced], self.numbers, [status.UNBALANCED])
         if w.script.moves:
             self._find_crowded()
         w.script.advance(w.x_start, w.u, t.fraction, w.count)

@@ -232,7 +232,7 @@ class LocalGlobal(Iterations):
 
     def _make(self) -> None:
         super()._make()
-        self.descent = Descent(self.work, frictional=False, descends=not self.model.has_friction)
+        self.descent = Descent(self.work, False, descends=not self.model.has_friction, weighs=not self.model.has_friction)
         matrix = self.model.solver.system.matrix
         self.work.truncation.neighbours = [
             wp.array(part, dtype=wp.int32, device=self.device.warp) for part in (matrix.indptr, matrix.indices)
