@@ -31,7 +31,13 @@ from pdipc.linear.wide_pcg import Operator
 
 @func
 def row(m: Mat43, s: int):
-    return wp.vector(m[s, 0], m[s, 1], m[s, 2])
+    return m[s]
+
+
+@func
+def outer(a: Vec4, v: Vec3):
+    """a v^T: the gradient of a . x where all vertices move along v."""
+    return wp.matrix_from_rows(a[0] * v, a[1] * v, a[2] * v, a[3] * v)
 
 
 @func
@@ -135,13 +141,13 @@ def bending(a: Vec4, edges: bool, p1: Vec3, p2: Vec3, p3: Vec3, along: Mat43):
     c12 = wp.dot(r1, r2)
     c22 = wp.dot(r2, r2)
     if c11 > zero:
-        first = (wp.outer(a, r1) + wp.outer(d1, r)) / wp.sqrt(c11)
+        first = (outer(a, r1) + outer(d1, r)) / wp.sqrt(c11)
         c22 = c22 - c12 * c12 / c11
     if c22 > type(c22)(1.0e-6) * wp.dot(r2, r2):
         l21 = zero
         if c11 > zero:
             l21 = c12 / wp.sqrt(c11)
-        second = (wp.outer(a, r2) + wp.outer(d2, r) - l21 * first) / wp.sqrt(c22)
+        second = (outer(a, r2) + outer(d2, r) - l21 * first) / wp.sqrt(c22)
     elif wp.dot(r2, r2) > zero:
         apart = False
     return wp.length(r), first, second, apart
@@ -205,8 +211,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 foreseen = d < zero
                 edges = k >= pairs.count[2]
                 b1, b2 = slopes(d, d_hat)
-                lever = wp.outer(a, n)
-                slope = wp.outer((km * b1) * a, n)
+                lever = outer(a, n)
+                slope = outer((km * b1) * a, n)
                 hessian = km * b2
                 bend = zero
                 first_bent = mat43()
