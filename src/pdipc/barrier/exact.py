@@ -21,7 +21,7 @@ import warp as wp
 from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
-from pdipc.device.language import Kernel, func, kernel, struct_of
+from pdipc.device.language import Kernel, filled, func, kernel, struct_of
 from pdipc.device.launch import Span
 from pdipc.device.precision import Mat43, Real, Scalar, Vec3, Vec4
 from pdipc.linear import contact_rows
@@ -470,12 +470,7 @@ class BarrierTerm(ActivePairs):
 
     def operand(self):
         """What the functions of `operator` work on."""
-        o = hessian_of(self.real)()
-        for name in ("count", "quads", "weights", "normals", "lever", "hessian", "bend", "first_bent", "second_bent"):
-            setattr(o, name, getattr(self, name))
-        for name in ("project", "ends", "entries", "places", "shares"):
-            setattr(o, name, getattr(self, name))
-        return o
+        return filled(hessian_of(self.real), self)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
-from pdipc.device.language import Kernel, func, kernel, struct_of
+from pdipc.device.language import Kernel, filled, func, kernel, struct_of
 from pdipc.device.launch import Span
 from pdipc.device.precision import Real, Scalar
 from pdipc.linear import contact_rows
@@ -308,10 +308,7 @@ class FrictionTerm:
 
     def operand(self):
         """What the functions of `operator` work on."""
-        o = hessian_of(self.real)()
-        for name in ("count", "quads", "weights", "block", "ends", "entries", "places", "shares"):
-            setattr(o, name, getattr(self, name))
-        return o
+        return filled(hessian_of(self.real), self)
 
 
 @functools.cache

@@ -24,7 +24,7 @@ import warp as wp
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
 from pdipc.collision.candidates import SILENT, Candidates
-from pdipc.device.language import Function, func, kernel, struct_of
+from pdipc.device.language import Function, filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
 
@@ -537,9 +537,7 @@ class FrozenPairs:
         self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
         self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
         self.coefficient, self.friction = make(real.scalar), make(real.scalar)
-        self.frozen = frozen(real)()
-        for name in ("count", "quads", "weights", "normals", "gaps", "activation", "stiffness", "coefficient"):
-            setattr(self.frozen, name, getattr(self, name))
+        self.frozen = filled(frozen(real), self)
         self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
