@@ -30,7 +30,6 @@ from pdipc.constraints.base import ConstraintSet, make_set
 from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
 
 NAME = "rod_frames"
 CORNERS = 5
@@ -74,7 +73,7 @@ def kernels(real: Real) -> SimpleNamespace:
     wide, wide3, wide4, wide33 = wp.float64, wp.vec3d, wp.vec4d, wp.mat33d
     module = real.module(__name__)
     element = wp.types.vector(CORNERS, wp.int32)
-    edges, symmetric = tets.functions(real), eigen.functions(real_of("float64")).symmetric
+    edges = tets.functions(real)
     table = wp.types.matrix((4, CORNERS), wide)
     zero, half, one, two = (wp.constant(wide(value)) for value in (0.0, 0.5, 1.0, 2.0))
 
@@ -251,7 +250,7 @@ def kernels(real: Real) -> SimpleNamespace:
         own = wp.trace(n) * wp.identity(n=3, dtype=wide) - half * (n + wp.transpose(n))
         cross = n - wp.trace(n) * wp.identity(n=3, dtype=wide)  # of omega_b, omega_a
         if project[0] != 0:
-            values, axes = symmetric(own)
+            values, axes = eigen.symmetric(own)
             own = wide33()
             for k in range(3):
                 own += wp.max(values[k], zero) * wp.outer(column(axes, k), column(axes, k))
