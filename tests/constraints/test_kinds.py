@@ -236,8 +236,8 @@ def columns(p):
 def test_triangle_projections_are_nearest():
     """Isometry: against the SVD. Area: determinant one, and no neighbour of area one in the plane is nearer."""
     rng = np.random.default_rng(7)
-    isometry = triangle_strain.functions(real("float64")).project
-    area = triangle_area.functions(real("float64")).project
+    isometry = triangle_strain.project
+    area = triangle_area.project
     for _ in range(100):
         f = rng.standard_normal((3, 2))
         p = columns(isometry(wp.vec3d(*f[:, 0]), wp.vec3d(*f[:, 1])))

@@ -22,7 +22,6 @@ from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real, Scalar
-from pdipc.device.precision import real as real_of
 
 NAME = "strain_limit"
 CORNERS = triangles.CORNERS
@@ -69,7 +68,7 @@ def barrier(s: Scalar, limit: Scalar):
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
     module = real.module(__name__)
-    f_of, own, wide_own = triangles.functions(real), triangles.hessians(real), triangles.hessians(real_of("float64"))
+    f_of, write = triangles.functions(real), triangles.writer(real)
     wide, tiny, close = wp.float64, wp.constant(scalar(1.0e-3)), wp.constant(scalar(CLOSE[real.name]))
 
     @kernel(module, "force")
@@ -88,7 +87,7 @@ def kernels(real: Real) -> SimpleNamespace:
         e = first + wp.tid()
         b = inverse[e]
         f = f_of.wide_deformation(base, u, vertices[e], b)
-        angle, s1, s2, u1, u2, _n = wide_own.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
+        angle, s1, s2, u1, u2, _n = triangles.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
         t1 = wide(weight[e]) * barrier(s1, wide(limit[e]))[1] * u1
         t2 = wide(weight[e]) * barrier(s2, wide(limit[e]))[1] * u2
         c = wp.cos(angle)
@@ -118,7 +117,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         e = first + wp.tid()
         f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
-        _angle, s1, s2, _u1, _u2, _n = wide_own.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
+        _angle, s1, s2, _u1, _u2, _n = triangles.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
         total = barrier(s1, wide(limit[e]))[0] + barrier(s2, wide(limit[e]))[0]
         energy_out[offset + e] = wide(weight[e]) * total
 
@@ -138,7 +137,7 @@ def kernels(real: Real) -> SimpleNamespace:
         """The six blocks of corners a <= b. W is convex: there is nothing to project."""
         e = first + wp.tid()
         f = f_of.deformation(base, u, vertices[e], inverse[e])
-        angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
+        angle, s1, s2, u1, u2, n = triangles.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
         w1 = barrier(s1, limit[e])
         w2 = barrier(s2, limit[e])
         # (W1 - W2) / (s1 - s2), from the middle where they are close
@@ -148,6 +147,6 @@ def kernels(real: Real) -> SimpleNamespace:
         pair = vec2((w1[1] + w2[1]) / wp.max(s1 + s2, tiny), flip)
         tilt = vec2(w1[1] / wp.max(s1, tiny), w2[1] / wp.max(s2, tiny))
         stretch = vec3(w1[2], scalar(0.0), w2[2])
-        own.write(stretch, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
+        write(stretch, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
