@@ -70,7 +70,10 @@ def warp_kernels(number) -> dict[str, wp.Kernel]:
 
         return run
 
-    return {"pdipc": make("pdipc_nearest", rotation.nearest_rotation), "wp.svd3": make("svd3_nearest", rotation.rotation_by_svd)}
+    return {
+        "pdipc": make("pdipc_nearest", rotation.nearest_rotation),
+        "wp.svd3": make("svd3_nearest", rotation.rotation_by_svd),
+    }
 
 
 def measure(precision: str, count: int, repeats: int) -> list[dict]:

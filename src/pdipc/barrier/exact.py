@@ -249,32 +249,26 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def measure_change(
         first: int,
-        count: wp.array(dtype=wp.int32),
+        pairs: Frozen,
         p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
         held: wp.array(dtype=scalar),
         change_out: wp.array(dtype=scalar),
     ):
         """By how much the motion p changes the curvature of each pair's barrier, as part of what it is with the inertia that it acts against."""
         k = first + wp.tid()
         result = zero
-        if k < count[0]:
-            q = quads[k]
-            a = weights[k]
+        if k < pairs.count[0]:
+            q = pairs.quads[k]
+            a = pairs.weights[k]
             lever = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
             yields = zero
             for s in range(4):
                 if held[q[s]] > zero:
                     yields += a[s] * a[s] / held[q[s]]
-            d = gaps[k]
-            after = wp.max(d + wp.dot(normals[k], lever), scalar(0.1) * d)
-            now = stiffness[k] * yields * barrier.barrier_hessian(d, activation[k])
-            then = stiffness[k] * yields * barrier.barrier_hessian(after, activation[k])
+            d = pairs.gaps[k]
+            after = wp.max(d + wp.dot(pairs.normals[k], lever), scalar(0.1) * d)
+            now = pairs.stiffness[k] * yields * barrier.barrier_hessian(d, pairs.activation[k])
+            then = pairs.stiffness[k] * yields * barrier.barrier_hessian(after, pairs.activation[k])
             result = wp.abs(then - now) / wp.max(now, one)
         change_out[k] = result
 
@@ -426,8 +420,7 @@ class BarrierTerm(ActivePairs):
         """Launches `change`: by how much the motion p would change the curvature of each frozen pair, as part of that, or of the inertia
         that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
         """
-        inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, held]
-        self.device.launch(self.exact.measure_change, self.capacity, [*inputs, self.change], grain=4)
+        self.device.launch(self.exact.measure_change, self.capacity, [self.frozen, p, held, self.change], grain=4)
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""
