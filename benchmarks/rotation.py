@@ -59,8 +59,7 @@ def by_numpy(matrices: np.ndarray) -> np.ndarray:
 
 
 def warp_kernels(number) -> dict[str, wp.Kernel]:
-    functions = rotation.functions(number)
-    nearest, by_svd, mat33 = functions.nearest_rotation, functions.rotation_by_svd, number.mat33
+    mat33 = number.mat33
     module = number.module(__name__)
 
     def make(name: str, function):
@@ -71,7 +70,10 @@ def warp_kernels(number) -> dict[str, wp.Kernel]:
 
         return run
 
-    return {"pdipc": make("pdipc_nearest", nearest), "wp.svd3": make("svd3_nearest", by_svd)}
+    return {
+        "pdipc": make("pdipc_nearest", rotation.nearest_rotation),
+        "wp.svd3": make("svd3_nearest", rotation.rotation_by_svd),
+    }
 
 
 def measure(precision: str, count: int, repeats: int) -> list[dict]:

@@ -16,9 +16,11 @@ import threading
 import time
 from pathlib import Path
 
+import dask
 from distributed import LocalCluster
 
 from pdipc import sweeps
+from pdipc.sweeps.cluster import SUCCESSOR_SECONDS
 
 RESULTS = Path(__file__).parent / "results" / "sweep_kills.json"
 SCENE = """
@@ -92,7 +94,10 @@ def main() -> None:
         sweeps.write_table(serial, cases, {})
         alone = time.perf_counter() - begun, time.process_time() - processor
         killed: list[tuple[str, int]] = []
-        with LocalCluster(n_workers=2, threads_per_worker=1, memory_limit=0, dashboard_address=None) as cluster:
+        with (
+            dask.config.set({"distributed.deploy.lost-worker-timeout": SUCCESSOR_SECONDS}),
+            LocalCluster(n_workers=2, threads_per_worker=1, memory_limit=0, dashboard_address=None) as cluster,
+        ):
             from distributed import Client
 
             with Client(cluster) as client:

@@ -5,6 +5,7 @@ linearly, so then they stay apart in between. An interval for which no n is foun
 prove what it can, with a margin far above its rounding, then in extended precision, and gives the rest to `pdipc.judge.exact`, where nothing rounds.
 """
 
+import functools
 from fractions import Fraction
 
 import numpy as np
@@ -96,11 +97,16 @@ def _separated(q, kind, low, high, separation, size) -> tuple[np.ndarray, np.nda
         for n in candidates(middle, kind):
             length = np.sqrt(np.einsum("ni,ni->n", n, n)) * (1 + margin)
             over = separation * length + margin * np.abs(n).sum(axis=1) * size
-            least = [np.einsum("ni,nki->nk", n, points).min(axis=1) for points in (begin, middle, end)]
+            least = [_least(np.einsum("ni,nki->nk", n, points)) for points in (begin, middle, end)]
             valid = (length > 1e-140) & np.isfinite(length)
             proven |= valid & (np.minimum(least[0], least[2]) > over)
             hopeless &= ~(valid & (least[1] > over))
     return proven, hopeless
+
+
+def _least(values: np.ndarray) -> np.ndarray:
+    """(n,) of (n, k); a reduction along so short an axis takes NumPy several times as long."""
+    return functools.reduce(np.minimum, values.T)
 
 
 def candidates(q, kind):

@@ -347,12 +347,12 @@ def _meet(points):
     apart = (above[0] * above[1] > 0) | ((around.min(axis=0) < 0) & (around.max(axis=0) > 0))
     # a direction across an edge and an axis on which all of the one is before all of the other, for what lies in a plane
     edges = [q - p, *(corners[k] - corners[k - 1] for k in range(3))]
-    differences = points[:, 2:, None] - points[:, None, :2]
-    size = margin * np.abs(differences).max(axis=(1, 2, 3))
+    differences = (points[:, 2:, None] - points[:, None, :2]).reshape(-1, 6, 3)
+    size = margin * np.abs(differences).max(axis=(1, 2))
     for edge in edges:
         for axis in np.eye(3, dtype=points.dtype):
             n = np.cross(edge, axis)
-            along = np.einsum("ni,nkji->nkj", n, differences)
-            room = size * np.abs(n).sum(axis=1)
-            apart |= (along.min(axis=(1, 2)) > room) | (along.max(axis=(1, 2)) < -room)
+            along = np.einsum("ni,nki->kn", n, differences)
+            room = size * np.einsum("ni->n", np.abs(n))
+            apart |= (functools.reduce(np.minimum, along) > room) | (functools.reduce(np.maximum, along) < -room)
     return meet.astype(int) - apart

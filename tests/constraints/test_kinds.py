@@ -27,6 +27,7 @@ from pdipc.constraints import (
     triangle_strain,
     woven,
 )
+from pdipc.constraints.rotation import nearest_rotation
 from pdipc.device.launch import Device
 from pdipc.device.precision import real
 
@@ -165,7 +166,7 @@ def test_along_free_axes_nothing_is_held():
 def test_strain_projects_to_the_nearest_rotation():
     """Against NumPy's SVD on near-rotations, stretched, inverted, flat, rank-one and zero matrices."""
     rng = np.random.default_rng(4)
-    project = tet_strain.functions(real("float64")).project
+    project = nearest_rotation
     cases = [rng.standard_normal((3, 3)) for _ in range(200)]
     cases += [
         rotation(rng) @ np.diag([1, 1, -1.0]),
@@ -189,7 +190,7 @@ def test_strain_projects_to_the_nearest_rotation():
 
 def test_rotation_in_float32_is_as_good_as_float32_allows():
     rng = np.random.default_rng(5)
-    project = tet_strain.functions(real("float32")).project
+    project = nearest_rotation
     for _ in range(200):
         f = rng.standard_normal((3, 3)).astype(np.float32)
         p = np.array(project(wp.mat33(*f.ravel()))).reshape(3, 3)
@@ -203,7 +204,7 @@ def test_rotation_in_float32_is_as_good_as_float32_allows():
 def test_rotation_in_float32_of_inverted_matrices():
     """The rotation may turn by rounding over s2 + s3 and no more, also where a SVD has to find it."""
     rng = np.random.default_rng(9)
-    project = tet_strain.functions(real("float32")).project
+    project = nearest_rotation
     for gap in (0.3, 0.1, 0.03, 0.01):
         for _ in range(25):
             u, v = rotation(rng), rotation(rng)
@@ -217,7 +218,7 @@ def test_rotation_in_float32_of_inverted_matrices():
 def test_volume_projection_is_nearest_among_its_neighbours():
     """No matrix of determinant one around the projection is nearer: moves along the manifold do not get closer."""
     rng = np.random.default_rng(6)
-    project = tet_volume.functions(real("float64")).project
+    project = tet_volume.project
     for _ in range(50):
         f = np.eye(3) + 0.3 * rng.standard_normal((3, 3))
         p = np.array(project(wp.mat33d(*f.ravel()))).reshape(3, 3)
@@ -235,8 +236,8 @@ def columns(p):
 def test_triangle_projections_are_nearest():
     """Isometry: against the SVD. Area: determinant one, and no neighbour of area one in the plane is nearer."""
     rng = np.random.default_rng(7)
-    isometry = triangle_strain.functions(real("float64")).project
-    area = triangle_area.functions(real("float64")).project
+    isometry = triangle_strain.project
+    area = triangle_area.project
     for _ in range(100):
         f = rng.standard_normal((3, 2))
         p = columns(isometry(wp.vec3d(*f[:, 0]), wp.vec3d(*f[:, 1])))

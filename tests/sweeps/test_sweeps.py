@@ -152,6 +152,29 @@ def test_killed_workers_are_replaced_and_their_runs_go_on(scene, tmp_path):
     assert smooth == pytest.approx(0.5 * 0.08, rel=0.02) and rough < 0.7 * smooth
 
 
+def test_the_only_worker_may_die_and_its_successor_be_slow(scene, tmp_path):
+    """Dask gives up a worker of this machine whose successor is not there in time; then no one would be left."""
+    import dask
+
+    scene.write_text(SCENE.replace("steps = 8", "steps = 300"))
+    settings, killed = {"contact.friction": [0.0]}, []
+
+    def kill():
+        while not killed:
+            for lock in (tmp_path / "swept").glob("*/run.lock"):
+                words = re.match(r"process (\d+) on", lock.read_text())
+                if words and (lock.parent / "frames" / "000010.npy").exists():
+                    os.kill(int(words[1]), signal.SIGKILL)
+                    killed.append(int(words[1]))
+            time.sleep(0.005)
+
+    threading.Thread(target=kill, daemon=True).start()
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": 0.1}):
+        assert sweeps.run_sweep(scene, settings, tmp_path / "swept", workers=1) == {}
+    assert len(killed) == 1
+    assert (tmp_path / "swept" / "table.csv").read_bytes() == serially(scene, settings, tmp_path / "serial")
+
+
 def test_a_run_goes_on_from_its_last_checkpoint_and_says_which(scene, tmp_path, monkeypatch):
     """Of five steps that are there when it was stopped, those after the checkpoint are taken again."""
     from pdipc import simulation

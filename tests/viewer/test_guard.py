@@ -71,6 +71,7 @@ def test_the_page_needs_the_token(url):
     ):
         assert page(wrong) == 403
     assert page(f"{url}../../etc/passwd") == 404
+    assert Guard("localhost").path_of("/\udcff\udced/") is None  # what bytes that are no text become
     assert page(url, Origin="https://evil.org") == 403
 
 

@@ -14,69 +14,182 @@ With a mollifier B is a function of d and c, whose 2x2 Hessian has one positive 
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.pairs import ActivePairs, Exerted
-from pdipc.device.language import Kernel, func, kernel, struct_of
+from pdipc.device.language import Kernel, filled, func, kernel, struct_of
 from pdipc.device.launch import Span
-from pdipc.device.precision import Real
+from pdipc.device.precision import Mat43, Real, Scalar, Vec3, Vec4
 from pdipc.linear import contact_rows
 from pdipc.linear.contact_rows import ContactRows, first_entry
 from pdipc.linear.wide_pcg import Operator
 
 
+@func
+def row(m: Mat43, s: int):
+    return m[s]
+
+
+@func
+def outer(a: Vec4, v: Vec3):
+    """a v^T: the gradient of a . x where all vertices move along v."""
+    return wp.matrix_from_rows(a[0] * v, a[1] * v, a[2] * v, a[3] * v)
+
+
+@func
+def free_directions(a: Vec4, edges: bool):
+    """da/dt of the parameters of the witness points that are not at an end."""
+    zero, one = type(a[0])(0.0), type(a[0])(1.0)
+    d1 = type(a)()
+    d2 = type(a)()
+    if edges:
+        if a[0] > zero and a[1] > zero:
+            d1[0] = -one
+            d1[1] = one
+        if a[2] < zero and a[3] < zero:
+            d2[2] = one
+            d2[3] = -one
+    else:
+        # from the first corner with a part to each later one
+        if a[1] < zero:
+            if a[2] < zero:
+                d1[1] = one
+                d1[2] = -one
+            if a[3] < zero:
+                d2[1] = one
+                d2[3] = -one
+        elif a[2] < zero and a[3] < zero:
+            d1[2] = one
+            d1[3] = -one
+    return d1, d2
+
+
+@func
+def slopes(gap: Scalar, d_hat: Scalar):
+    """b' and b'' of a pair. Where the gap has a minus it is foreseen, and these are of the tangent of the barrier where the gap will be, seen from
+    here; see `ActivePairs.freeze`.
+    """
+    if gap < type(gap)(0.0):
+        at = type(gap)(barrier.FORESEEN) * d_hat
+        steep = barrier.barrier_hessian(at, d_hat)
+        return barrier.barrier_gradient(at, d_hat) - steep * (gap + at), steep
+    return barrier.barrier_gradient(gap, d_hat), barrier.barrier_hessian(gap, d_hat)
+
+
+@func
+def mollified(gap: Scalar, d_hat: Scalar, c: Scalar, g1: Vec3, g2: Vec3, along: Mat43):
+    """Of m(c) b(d), 0 < c < 1: its gradient by c times that of c, and the direction and the curvature of the positive part of its Hessian.
+
+    g1, g2: gradients of c by the two edge vectors. along: a n^T, the gradient of d. All per unit of kappa.
+    """
+    zero, one, two = type(gap)(0.0), type(gap)(1.0), type(gap)(2.0)
+    b0 = barrier.barrier(gap, d_hat)
+    b1 = barrier.barrier_gradient(gap, d_hat)
+    b2 = barrier.barrier_hessian(gap, d_hat)
+    slant = two - two * c
+    turn = wp.matrix_from_rows(-g1, g1, -g2, g2)
+    alpha = wp.sqrt(wp.ddot(along, along))
+    beta = wp.ddot(along, turn) / alpha
+    rest = turn - (beta / alpha) * along
+    gamma = wp.sqrt(wp.ddot(rest, rest))
+    s_dd = c * (two - c) * b2
+    s_dc = b1 * slant
+    s_cc = -two * b0
+    h11 = alpha * alpha * s_dd + two * alpha * beta * s_dc + beta * beta * s_cc
+    h12 = gamma * (alpha * s_dc + beta * s_cc)
+    h22 = gamma * gamma * s_cc
+    half = type(gap)(0.5) * (h11 - h22)
+    spread = wp.sqrt(half * half + h12 * h12)
+    largest = type(gap)(0.5) * (h11 + h22) + spread
+    v1 = one
+    v2 = zero
+    if gamma > zero and wp.abs(h12) > zero:
+        # of the two forms of the eigenvector the one without cancellation
+        if half >= zero:
+            v1 = half + spread
+            v2 = h12
+        else:
+            v1 = h12
+            v2 = spread - half
+        size = wp.sqrt(v1 * v1 + v2 * v2)
+        v1 = v1 / size
+        v2 = v2 / (size * gamma)
+    else:
+        largest = h11
+    return b0 * slant, turn, (v1 / alpha) * along + v2 * rest, wp.max(largest, zero)
+
+
+@func
+def bending(a: Vec4, edges: bool, p1: Vec3, p2: Vec3, p3: Vec3, along: Mat43):
+    """What turns n and moves the witness points, for vertices at 0, p1, p2 and p3: |r|; the two q, zero where a parameter is not free; and whether
+    they can be told apart. along: a n^T.
+    """
+    zero = type(a[0])(0.0)
+    d1, d2 = free_directions(a, edges)
+    r = a[1] * p1 + a[2] * p2 + a[3] * p3
+    r1 = d1[1] * p1 + d1[2] * p2 + d1[3] * p3
+    r2 = d2[1] * p1 + d2[2] * p2 + d2[3] * p3
+    first = type(along)()
+    second = type(along)()
+    apart = bool(True)
+    # Cholesky of C; a parameter that is not free has no direction
+    c11 = wp.dot(r1, r1)
+    c12 = wp.dot(r1, r2)
+    c22 = wp.dot(r2, r2)
+    if c11 > zero:
+        first = (outer(a, r1) + outer(d1, r)) / wp.sqrt(c11)
+        c22 = c22 - c12 * c12 / c11
+    if c22 > type(c22)(1.0e-6) * wp.dot(r2, r2):
+        l21 = zero
+        if c11 > zero:
+            l21 = c12 / wp.sqrt(c11)
+        second = (outer(a, r2) + outer(d2, r) - l21 * first) / wp.sqrt(c22)
+    elif wp.dot(r2, r2) > zero:
+        apart = False
+    return wp.length(r), first, second, apart
+
+
+@functools.cache
+def hessian_of(real: Real) -> Any:
+    """A struct: the Hessian of the pairs, and what a product with it leaves at each pair or vertex."""
+    scalar, vec3, mat43 = real.scalar, real.vec3, wp.types.matrix((4, 3), real.scalar)
+    return struct_of(
+        "Hessian",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        quads=wp.array(dtype=wp.vec4i),
+        weights=wp.array(dtype=real.vec4),
+        normals=wp.array(dtype=vec3),
+        lever=wp.array(dtype=mat43),  # direction and
+        hessian=wp.array(dtype=scalar),  # curvature, N/m, of the part that is always there
+        bend=wp.array(dtype=scalar),  # -kappa b' / |r|, N/m, of the part that is left out where it is projected,
+        first_bent=wp.array(dtype=mat43),  # with the two q
+        second_bent=wp.array(dtype=mat43),
+        project=wp.array(dtype=wp.int32),  # (1,) whether that is so
+        ends=wp.array(dtype=wp.int32),  # of each vertex, where its pairs end in
+        entries=wp.array(dtype=wp.int32),  # 4 pair + place
+        places=wp.array(dtype=wp.int32),  # of each pair's vertices in these lists, on CUDA, and
+        shares=wp.array(dtype=vec3),  # what each gets there, N
+    )
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     mat43 = wp.types.matrix((4, 3), scalar)
+    Frozen, Hessian = pairs.frozen(real), hessian_of(real)
     module = real.module(__name__)
-    zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
+    zero, one = wp.constant(scalar(0.0)), wp.constant(scalar(1.0))
 
-    @func
-    def row(m: mat43, s: int) -> vec3:
-        return vec3(m[s, 0], m[s, 1], m[s, 2])
-
-    @func
-    def free_directions(a: vec4, edges: bool):
-        """da/dt of the parameters of the witness points that are not at an end."""
-        d1 = vec4()
-        d2 = vec4()
-        if edges:
-            if a[0] > zero and a[1] > zero:
-                d1[0] = -one
-                d1[1] = one
-            if a[2] < zero and a[3] < zero:
-                d2[2] = one
-                d2[3] = -one
-        else:
-            # from the first corner with a part to each later one
-            if a[1] < zero:
-                if a[2] < zero:
-                    d1[1] = one
-                    d1[2] = -one
-                if a[3] < zero:
-                    d2[1] = one
-                    d2[3] = -one
-            elif a[2] < zero and a[3] < zero:
-                d1[2] = one
-                d1[3] = -one
-        return d1, d2
-
-    # Long: energy, gradient and Hessian of a pair, which share all that is computed of it.
     @kernel(module)
     def differentiate(
         span: Span,
-        count: wp.array(dtype=wp.int32),
+        pairs: Frozen,
         x: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
         energy_out: wp.array(dtype=wp.float64),
         slope_out: wp.array(dtype=mat43),
         lever_out: wp.array(dtype=mat43),
@@ -87,121 +200,44 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Energy, J; its gradient, N, at the four vertices; and the direction and curvature, N/m, of the Hessian."""
         worker = span.first + wp.tid()
-        for begin in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(begin, wp.min(begin + span.block, count[0])):
-                a = weights[k]
-                n = normals[k]
-                d = gaps[k]
-                d_hat = activation[k]
-                km = stiffness[k]
+        for begin in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, pairs.count[0])):
+                q = pairs.quads[k]
+                a = pairs.weights[k]
+                n = pairs.normals[k]
+                d = pairs.gaps[k]
+                d_hat = pairs.activation[k]
+                km = pairs.stiffness[k]
                 foreseen = d < zero
-                b1 = zero
-                b2 = zero
-                if not foreseen:
-                    b1 = barrier.barrier_gradient(d, d_hat)
-                    b2 = barrier.barrier_hessian(d, d_hat)
-                else:
-                    # the tangent of the barrier where the gap will be, seen from here; see `ActivePairs.freeze`
-                    at = scalar(barrier.FORESEEN) * d_hat
-                    b2 = barrier.barrier_hessian(at, d_hat)
-                    b1 = barrier.barrier_gradient(at, d_hat) - b2 * (d + at)
-                slope = mat43()
-                lever = mat43()
+                edges = k >= pairs.count[2]
+                b1, b2 = slopes(d, d_hat)
+                lever = outer(a, n)
+                slope = outer((km * b1) * a, n)
                 hessian = km * b2
-                for s in range(4):
-                    for axis in range(3):
-                        lever[s, axis] = a[s] * n[axis]
-                        slope[s, axis] = km * b1 * a[s] * n[axis]
-                # in double precision: what tells two iterates apart may be far below one energy
-                q = quads[k]
                 bend = zero
                 first_bent = mat43()
                 second_bent = mat43()
+                # in double precision: what tells two iterates apart may be far below one energy
                 energy = wp.float64(0.0)
                 if not foreseen:
                     energy = wp.float64(km) * barrier.barrier(wp.float64(d), wp.float64(d_hat))
-                plain = True
-                if k >= count[2] and not foreseen:
-                    e1 = x[q[1]] - x[q[0]]
-                    e2 = x[q[3]] - x[q[2]]
-                    c, g1, g2 = barrier.parallel_gradient(e1, e2)
+                plain = not foreseen
+                if edges and not foreseen:
+                    c, g1, g2 = barrier.parallel_gradient(x[q[1]] - x[q[0]], x[q[3]] - x[q[2]])
                     if c < one and c > zero:
                         plain = False
-                        m = c * (two - c)
-                        kappa = km / m
-                        b0 = barrier.barrier(d, d_hat)
-                        slant = two - two * c
-                        # the two gradients: a n, and that of c, which is (-g1, g1, -g2, g2)
-                        turn = mat43(
-                            -g1[0], -g1[1], -g1[2],
-                            g1[0], g1[1], g1[2],
-                            -g2[0], -g2[1], -g2[2],
-                            g2[0], g2[1], g2[2],
-                        )  # fmt: skip
-                        slope += (kappa * b0 * slant) * turn
-                        alpha = wp.sqrt(wp.ddot(lever, lever))
-                        beta = wp.ddot(lever, turn) / alpha
-                        rest = turn - (beta / alpha) * lever
-                        gamma = wp.sqrt(wp.ddot(rest, rest))
-                        s_dd = m * b2
-                        s_dc = b1 * slant
-                        s_cc = -two * b0
-                        h11 = alpha * alpha * s_dd + two * alpha * beta * s_dc + beta * beta * s_cc
-                        h12 = gamma * (alpha * s_dc + beta * s_cc)
-                        h22 = gamma * gamma * s_cc
-                        half = scalar(0.5) * (h11 - h22)
-                        spread = wp.sqrt(half * half + h12 * h12)
-                        largest = scalar(0.5) * (h11 + h22) + spread
-                        v1 = one
-                        v2 = zero
-                        if gamma > zero and wp.abs(h12) > zero:
-                            # of the two forms of the eigenvector the one without cancellation
-                            if half >= zero:
-                                v1 = half + spread
-                                v2 = h12
-                            else:
-                                v1 = h12
-                                v2 = spread - half
-                            size = wp.sqrt(v1 * v1 + v2 * v2)
-                            v1 = v1 / size
-                            v2 = v2 / (size * gamma)
-                        else:
-                            largest = h11
-                        lever = (v1 / alpha) * lever + v2 * rest
-                        hessian = kappa * wp.max(largest, zero)
-                if plain and not foreseen:
-                    d1, d2 = free_directions(a, k >= count[2])
+                        kappa = km / (c * (scalar(2.0) - c))
+                        fading, turn, direction, curvature = mollified(d, d_hat, c, g1, g2, lever)
+                        slope += (kappa * fading) * turn
+                        lever = direction
+                        hessian = kappa * curvature
+                if plain:
                     x0 = x[q[0]]
-                    p1 = x[q[1]] - x0
-                    p2 = x[q[2]] - x0
-                    p3 = x[q[3]] - x0
-                    r = a[1] * p1 + a[2] * p2 + a[3] * p3
-                    r1 = d1[1] * p1 + d1[2] * p2 + d1[3] * p3
-                    r2 = d2[1] * p1 + d2[2] * p2 + d2[3] * p3
-                    distance = wp.length(r)
-                    if distance > zero:
+                    distance, first_q, second_q, apart = bending(a, edges, x[q[1]] - x0, x[q[2]] - x0, x[q[3]] - x0, lever)
+                    first_bent = first_q
+                    second_bent = second_q
+                    if apart and distance > zero:
                         bend = -km * b1 / distance
-                    # Cholesky of C; a parameter that is not free has no direction
-                    c11 = wp.dot(r1, r1)
-                    c12 = wp.dot(r1, r2)
-                    c22 = wp.dot(r2, r2)
-                    if c11 > zero:
-                        l11 = wp.sqrt(c11)
-                        for s in range(4):
-                            for axis in range(3):
-                                first_bent[s, axis] = (a[s] * r1[axis] + d1[s] * r[axis]) / l11
-                        c22 = c22 - c12 * c12 / c11
-                    if c22 > scalar(1.0e-6) * wp.dot(r2, r2):
-                        l22 = wp.sqrt(c22)
-                        l21 = zero
-                        if c11 > zero:
-                            l21 = c12 / wp.sqrt(c11)
-                        for s in range(4):
-                            for axis in range(3):
-                                own = a[s] * r2[axis] + d2[s] * r[axis]
-                                second_bent[s, axis] = (own - l21 * first_bent[s, axis]) / l22
-                    elif wp.dot(r2, r2) > zero:
-                        bend = zero
                 bend_out[k] = bend
                 first_out[k] = first_bent
                 second_out[k] = second_bent
@@ -213,32 +249,26 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def measure_change(
         first: int,
-        count: wp.array(dtype=wp.int32),
+        pairs: Frozen,
         p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
         held: wp.array(dtype=scalar),
         change_out: wp.array(dtype=scalar),
     ):
         """By how much the motion p changes the curvature of each pair's barrier, as part of what it is with the inertia that it acts against."""
         k = first + wp.tid()
         result = zero
-        if k < count[0]:
-            q = quads[k]
-            a = weights[k]
+        if k < pairs.count[0]:
+            q = pairs.quads[k]
+            a = pairs.weights[k]
             lever = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
             yields = zero
             for s in range(4):
                 if held[q[s]] > zero:
                     yields += a[s] * a[s] / held[q[s]]
-            d = gaps[k]
-            after = wp.max(d + wp.dot(normals[k], lever), scalar(0.1) * d)
-            now = stiffness[k] * yields * barrier.barrier_hessian(d, activation[k])
-            then = stiffness[k] * yields * barrier.barrier_hessian(after, activation[k])
+            d = pairs.gaps[k]
+            after = wp.max(d + wp.dot(pairs.normals[k], lever), scalar(0.1) * d)
+            now = pairs.stiffness[k] * yields * barrier.barrier_hessian(d, pairs.activation[k])
+            then = pairs.stiffness[k] * yields * barrier.barrier_hessian(after, pairs.activation[k])
             result = wp.abs(then - now) / wp.max(now, one)
         change_out[k] = result
 
@@ -282,115 +312,71 @@ def kernels(real: Real) -> SimpleNamespace:
         diagonal_out[v] = d
         energy_out[v] = own
 
-    # Arguments: a pair as it is frozen, and where its part goes.
     @func
-    def feel(
-        k: int,
-        p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        lever: wp.array(dtype=mat43),
-        hessian: wp.array(dtype=scalar),
-        bend: wp.array(dtype=scalar),
-        first_bent: wp.array(dtype=mat43),
-        second_bent: wp.array(dtype=mat43),
-        project: wp.array(dtype=wp.int32),
-    ):
+    def feel(o: Hessian, k: int, p: wp.array(dtype=vec3)):
         """Of pair k under p: what its three directions feel, N, the part of a I, and p . (Hessian) p."""
-        q = quads[k]
+        q = o.quads[k]
         p0 = p[q[0]]
         p1 = p[q[1]]
         p2 = p[q[2]]
         p3 = p[q[3]]
-        j = lever[k]
+        j = o.lever[k]
         along = wp.dot(row(j, 0), p0) + wp.dot(row(j, 1), p1) + wp.dot(row(j, 2), p2) + wp.dot(row(j, 3), p3)
-        response = vec3(hessian[k] * along, zero, zero)
+        response = vec3(o.hessian[k] * along, zero, zero)
         across = vec3()
         work = response[0] * along
-        if project[0] == 0 and bend[k] > zero:
-            c = bend[k]
-            a = weights[k]
+        if o.project[0] == 0 and o.bend[k] > zero:
+            c = o.bend[k]
+            a = o.weights[k]
+            n = o.normals[k]
             u = a[0] * p0 + a[1] * p1 + a[2] * p2 + a[3] * p3
-            across = -c * (u - wp.dot(normals[k], u) * normals[k])
-            g = first_bent[k]
+            across = -c * (u - wp.dot(n, u) * n)
+            g = o.first_bent[k]
             bent = wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
             response[1] = c * bent
             work += wp.dot(across, u) + response[1] * bent
-            g = second_bent[k]
+            g = o.second_bent[k]
             bent = wp.dot(row(g, 0), p0) + wp.dot(row(g, 1), p1) + wp.dot(row(g, 2), p2) + wp.dot(row(g, 3), p3)
             response[2] = c * bent
             work += response[2] * bent
         return response, across, work
 
     @func
-    def exert(
-        v: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        lever: wp.array(dtype=mat43),
-        first_bent: wp.array(dtype=mat43),
-        second_bent: wp.array(dtype=mat43),
-        project: wp.array(dtype=wp.int32),
-        response: wp.array(dtype=vec3),
-        across: wp.array(dtype=vec3),
-    ) -> vec3:
+    def exert(o: Hessian, v: int, response: wp.array(dtype=vec3), across: wp.array(dtype=vec3)) -> vec3:
         """What the pairs of vertex v make of what they feel."""
         total = vec3()
-        for i in range(first_entry(v, ends), ends[v]):
-            k = entries[i] // 4
-            s = entries[i] % 4
-            total += response[k][0] * row(lever[k], s)
-            if project[0] == 0:
-                total += weights[k][s] * across[k]
-                total += response[k][1] * row(first_bent[k], s) + response[k][2] * row(second_bent[k], s)
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            s = o.entries[i] % 4
+            total += response[k][0] * row(o.lever[k], s)
+            if o.project[0] == 0:
+                total += o.weights[k][s] * across[k]
+                total += response[k][1] * row(o.first_bent[k], s) + response[k][2] * row(o.second_bent[k], s)
         return total
 
     @kernel(module)
     def stretch(
-        span: Span,
-        count: wp.array(dtype=wp.int32),
-        p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        lever: wp.array(dtype=mat43),
-        hessian: wp.array(dtype=scalar),
-        bend: wp.array(dtype=scalar),
-        first_bent: wp.array(dtype=mat43),
-        second_bent: wp.array(dtype=mat43),
-        project: wp.array(dtype=wp.int32),
-        response_out: wp.array(dtype=vec3),
-        across_out: wp.array(dtype=vec3),
+        span: Span, o: Hessian, p: wp.array(dtype=vec3), response_out: wp.array(dtype=vec3), across_out: wp.array(dtype=vec3)
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                response, across, _work = feel(
-                    k, p, quads, weights, normals, lever, hessian, bend, first_bent, second_bent, project
-                )
+        for b in range(worker * span.block, o.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, o.count[0])):
+                response, across, _work = feel(o, k, p)
                 response_out[k] = response
                 across_out[k] = across
 
     @kernel(module)
     def spread(
         first: int,
+        o: Hessian,
         free: wp.array(dtype=scalar),
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        lever: wp.array(dtype=mat43),
-        first_bent: wp.array(dtype=mat43),
-        second_bent: wp.array(dtype=mat43),
-        project: wp.array(dtype=wp.int32),
         response: wp.array(dtype=vec3),
         across: wp.array(dtype=vec3),
         y: wp.array(dtype=vec3),
     ):
         v = first + wp.tid()
-        if free[v] > zero and ends[v] > first_entry(v, ends):
-            y[v] = y[v] + exert(v, ends, entries, weights, lever, first_bent, second_bent, project, response, across)
+        if free[v] > zero and o.ends[v] > first_entry(v, o.ends):
+            y[v] = y[v] + exert(o, v, response, across)
 
     return SimpleNamespace(
         differentiate=differentiate,
@@ -399,9 +385,7 @@ def kernels(real: Real) -> SimpleNamespace:
         stretch=stretch,
         spread=spread,
         mat43=mat43,
-        row=row,
         feel=feel,
-        exert=exert,
     )
 
 
@@ -436,16 +420,14 @@ class BarrierTerm(ActivePairs):
         """Launches `change`: by how much the motion p would change the curvature of each frozen pair, as part of that, or of the inertia
         that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
         """
-        inputs = [self.count, p, self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, held]
-        self.device.launch(self.exact.measure_change, self.capacity, [*inputs, self.change], grain=4)
+        self.device.launch(self.exact.measure_change, self.capacity, [self.frozen, p, held, self.change], grain=4)
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""
         k, device = self.exact, self.device
-        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness]
         result = [self.energy_of_pair, self.slope, self.lever, self.hessian]
         bent = [self.bend, self.first_bent, self.second_bent]
-        device.launch_list(k.differentiate, self.capacity, [self.count, x, *frozen, *result, *bent])
+        device.launch_list(k.differentiate, self.capacity, [self.frozen, x, *result, *bent])
         inputs = [self.ends, self.entries, self.quads, self.free, *result]
         device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
 
@@ -467,11 +449,9 @@ class BarrierTerm(ActivePairs):
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p at free vertices, pair by pair and gathered per vertex. Recordable."""
         k, device = self.exact, self.device
-        bent = [self.first_bent, self.second_bent, self.project]
-        inputs = [self.count, p, self.quads, self.weights, self.normals, self.lever, self.hessian, self.bend, *bent]
-        device.launch_list(k.stretch, self.capacity, [*inputs, self.felt, self.across])
-        inputs = [self.free, self.ends, self.entries, self.weights, self.lever, *bent, self.felt, self.across]
-        device.launch(k.spread, len(self.ends), [*inputs, y])
+        o = self.operand()
+        device.launch_list(k.stretch, self.capacity, [o, p, self.felt, self.across])
+        device.launch(k.spread, len(self.ends), [o, self.free, self.felt, self.across, y])
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
@@ -483,53 +463,18 @@ class BarrierTerm(ActivePairs):
 
     def operand(self):
         """What the functions of `operator` work on."""
-        o = operator(self.real).Operand()
-        for name in ("count", "quads", "weights", "normals", "lever", "hessian", "bend", "first_bent", "second_bent"):
-            setattr(o, name, getattr(self, name))
-        o.project, o.ends, o.places, o.shares = self.project, self.ends, self.places, self.shares
-        return o
+        return filled(hessian_of(self.real), self)
 
 
 @functools.cache
 def operator(real: Real) -> Operator:
     """The Hessian for the kernels of `wide_pcg`."""
-    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
-    k_of = kernels(real)
-    mat43, feel_pair, row, total_share = k_of.mat43, k_of.feel, k_of.row, pairs.total_share(real)
-
-    Operand = struct_of(
-        "Operand",
-        __name__,
-        count=wp.array(dtype=wp.int32),
-        quads=wp.array(dtype=wp.vec4i),
-        weights=wp.array(dtype=vec4),
-        normals=wp.array(dtype=vec3),
-        lever=wp.array(dtype=mat43),
-        hessian=wp.array(dtype=scalar),
-        bend=wp.array(dtype=scalar),
-        first_bent=wp.array(dtype=mat43),
-        second_bent=wp.array(dtype=mat43),
-        project=wp.array(dtype=wp.int32),
-        ends=wp.array(dtype=wp.int32),
-        places=wp.array(dtype=wp.int32),
-        shares=wp.array(dtype=vec3),
-    )
+    scalar, vec3, Hessian = real.scalar, real.vec3, hessian_of(real)
+    feel_pair, total_share = kernels(real).feel, pairs.total_share(real)
 
     @func
-    def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
-        response, across, work = feel_pair(
-            k,
-            p,
-            o.quads,
-            o.weights,
-            o.normals,
-            o.lever,
-            o.hessian,
-            o.bend,
-            o.first_bent,
-            o.second_bent,
-            o.project,
-        )
+    def feel(o: Hessian, k: int, p: wp.array(dtype=vec3)) -> scalar:
+        response, across, work = feel_pair(o, k, p)
         for s in range(4):
             share = response[0] * row(o.lever[k], s)
             if o.project[0] == 0:
@@ -539,20 +484,20 @@ def operator(real: Real) -> Operator:
         return work
 
     @func
-    def exert(o: Operand, v: int) -> vec3:
+    def exert(o: Hessian, v: int) -> vec3:
         return total_share(v, o.ends, o.shares)
 
-    return Operator(Operand, feel, exert)
+    return Operator(Hessian, feel, exert)
 
 
 @functools.cache
 def assembly(real: Real) -> Kernel:
     """The kernel that fills the rows of the Hessian."""
-    mat33, row, Operand = real.mat33, kernels(real).row, operator(real).Operand
+    mat33, Hessian = real.mat33, hessian_of(real)
     identity = wp.constant(mat33(1, 0, 0, 0, 1, 0, 0, 0, 1))
 
     @func
-    def block_of(o: Operand, k: int, s: int, t: int) -> mat33:
+    def block_of(o: Hessian, k: int, s: int, t: int) -> mat33:
         block = o.hessian[k] * wp.outer(row(o.lever[k], s), row(o.lever[k], t))
         if o.project[0] == 0 and o.bend[k] > real.scalar(0.0):
             n = o.normals[k]
@@ -561,7 +506,7 @@ def assembly(real: Real) -> Kernel:
             block -= (o.bend[k] * o.weights[k][s] * o.weights[k][t]) * (identity - wp.outer(n, n))
         return block
 
-    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Operand, block_of)
+    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Hessian, block_of)
 
 
 @functools.cache
@@ -569,10 +514,7 @@ def wide_coupling(real: Real) -> Kernel:
     """`coupling` with a block of threads a pair of groups."""
     from pdipc.linear import wide_modes
 
-    scalar = real.scalar
-    k_of = kernels(real)
-    row, mat43 = k_of.row, k_of.mat43
-    wide = wp.float64
+    scalar, mat43, wide = real.scalar, kernels(real).mat43, wp.float64
 
     @func
     def block_of(k: int, s: int, t: int, lever: wp.array(dtype=mat43), hessian: wp.array(dtype=scalar)) -> wp.mat33d:
@@ -591,8 +533,7 @@ def coupling(real: Real) -> Kernel:
     from pdipc.linear import rigid_modes
 
     scalar, vec3 = real.scalar, real.vec3
-    f, k_of = rigid_modes.functions(real), kernels(real)
-    row, mat43, _vec6 = k_of.row, k_of.mat43, f.vec6
+    f, mat43 = rigid_modes.functions(real), kernels(real).mat43
 
     @kernel(real.module(f"{__name__}.coupling"))
     def couple(

@@ -7,6 +7,7 @@ u_i is the displacement of a vertex since the start of the step. lambda, a and n
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -14,31 +15,54 @@ from pdipc.barrier import pairs
 from pdipc.barrier import potential as barrier
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import Exerted, listed
-from pdipc.device.language import Kernel, func, kernel, struct_of
+from pdipc.device.language import Kernel, filled, func, kernel, struct_of
 from pdipc.device.launch import Span
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar
 from pdipc.linear import contact_rows
 from pdipc.linear.contact_rows import ContactRows, first_entry
 from pdipc.linear.wide_pcg import Operator
 
 
+@func
+def dissipation(slip: Scalar, threshold: Scalar):
+    """f0(|u|), m, and f1(|u|), of 1, for slip = |u|: f0 begins at a third of the threshold and goes on as |u|."""
+    one = type(slip)(1.0)
+    y = slip / threshold
+    if y < one:
+        return threshold * (y * y - y * y * y / type(slip)(3.0) + one / type(slip)(3.0)), (
+            type(slip)(2.0) - type(slip)(2.0) * y
+        )
+    return slip, type(slip)(0.0)
+
+
+@functools.cache
+def hessian_of(real: Real) -> Any:
+    """A struct: the Hessian of the pairs, and what a product with it leaves at each vertex."""
+    return struct_of(
+        "FrictionHessian",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        quads=wp.array(dtype=wp.vec4i),
+        weights=wp.array(dtype=real.vec4),
+        block=wp.array(dtype=real.mat33),  # N/m, per unit of both weights
+        ends=wp.array(dtype=wp.int32),  # of each vertex, where its pairs end in
+        entries=wp.array(dtype=wp.int32),  # 4 pair + place
+        places=wp.array(dtype=wp.int32),  # of each pair's vertices in these lists, on CUDA, and
+        shares=wp.array(dtype=real.vec3),  # what each gets there, N
+    )
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    Frozen, Hessian = pairs.frozen(real), hessian_of(real)
     module = real.module(__name__)
-    zero, one, two = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
+    zero = wp.constant(scalar(0.0))
 
     @kernel(module)
     def copy(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
-        coefficient: wp.array(dtype=scalar),
+        pairs: Frozen,
         entries: wp.array(dtype=wp.int32),
         quads_out: wp.array(dtype=wp.vec4i),
         weights_out: wp.array(dtype=vec4),
@@ -47,12 +71,13 @@ def kernels(real: Real) -> SimpleNamespace:
         entries_out: wp.array(dtype=wp.int32),
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                quads_out[k] = quads[k]
-                weights_out[k] = weights[k]
-                normals_out[k] = normals[k]
-                limit_out[k] = -coefficient[k] * stiffness[k] * barrier.barrier_gradient(gaps[k], activation[k])
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
+                quads_out[k] = pairs.quads[k]
+                weights_out[k] = pairs.weights[k]
+                normals_out[k] = pairs.normals[k]
+                steep = barrier.barrier_gradient(pairs.gaps[k], pairs.activation[k])
+                limit_out[k] = -pairs.coefficient[k] * pairs.stiffness[k] * steep
                 for s in range(4):
                     entries_out[4 * k + s] = entries[4 * k + s]
 
@@ -107,12 +132,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 s = slip(quads[k], weights[k], n, u)
                 size = wp.length(s)
                 rate = limit[k] * barrier.smoothed_coulomb(size, threshold)
-                y = size / threshold
-                length = size
-                along = zero
-                if y < one:
-                    length = threshold * (y * y - y * y * y / scalar(3.0) + one / scalar(3.0))
-                    along = limit[k] * (two - two * y) / threshold
+                length, rising = dissipation(size, threshold)
+                along = limit[k] * rising / threshold
                 energy_out[k] = wp.float64(limit[k]) * wp.float64(length)
                 force_out[k] = -rate * s
                 h = rate * (mat33(wp.identity(n=3, dtype=scalar)) - wp.outer(n, n))
@@ -163,64 +184,36 @@ def kernels(real: Real) -> SimpleNamespace:
         energy_out[v] = own
 
     @func
-    def feel(
-        k: int,
-        p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        block: wp.array(dtype=mat33),
-    ):
+    def feel(o: Hessian, k: int, p: wp.array(dtype=vec3)):
         """Of pair k under p: its force, N, per unit of weight, and p . (Hessian) p."""
-        q = quads[k]
-        a = weights[k]
+        q = o.quads[k]
+        a = o.weights[k]
         s = a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]]
-        response = block[k] * s
+        response = o.block[k] * s
         return response, wp.dot(response, s)
 
     @func
-    def exert(
-        v: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        response: wp.array(dtype=vec3),
-    ) -> vec3:
+    def exert(o: Hessian, v: int, response: wp.array(dtype=vec3)) -> vec3:
         """What the pairs of vertex v make of what they feel."""
         total = vec3()
-        for i in range(first_entry(v, ends), ends[v]):
-            k = entries[i] // 4
-            total += weights[k][entries[i] % 4] * response[k]
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            total += o.weights[k][o.entries[i] % 4] * response[k]
         return total
 
     @kernel(module)
-    def stretch(
-        span: Span,
-        count: wp.array(dtype=wp.int32),
-        p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        block: wp.array(dtype=mat33),
-        response_out: wp.array(dtype=vec3),
-    ):
+    def stretch(span: Span, o: Hessian, p: wp.array(dtype=vec3), response_out: wp.array(dtype=vec3)):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                response, _work = feel(k, p, quads, weights, block)
+        for b in range(worker * span.block, o.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, o.count[0])):
+                response, _work = feel(o, k, p)
                 response_out[k] = response
 
     @kernel(module)
-    def spread(
-        first: int,
-        free: wp.array(dtype=scalar),
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        response: wp.array(dtype=vec3),
-        y: wp.array(dtype=vec3),
-    ):
+    def spread(first: int, o: Hessian, free: wp.array(dtype=scalar), response: wp.array(dtype=vec3), y: wp.array(dtype=vec3)):
         v = first + wp.tid()
-        if free[v] > zero and ends[v] > first_entry(v, ends):
-            y[v] = y[v] + exert(v, ends, entries, weights, response)
+        if free[v] > zero and o.ends[v] > first_entry(v, o.ends):
+            y[v] = y[v] + exert(o, v, response)
 
     return SimpleNamespace(
         copy=copy,
@@ -231,7 +224,6 @@ def kernels(real: Real) -> SimpleNamespace:
         stretch=stretch,
         spread=spread,
         feel=feel,
-        exert=exert,
     )
 
 
@@ -273,8 +265,8 @@ class FrictionTerm:
         """Launches the copy of the barrier's pairs, with the normal forces that they have now."""
         k, device, s = self.kernels, self.device, self.source
         device.launch(k.copy_ends, len(self.ends), [s.count, s.ends, self.count, self.ends])
-        inputs = [s.count, s.quads, s.weights, s.normals, s.gaps, s.activation, s.stiffness, s.coefficient, s.entries]
-        device.launch_list(k.copy, self.capacity, [*inputs, self.quads, self.weights, self.normals, self.limit, self.entries])
+        copies = [self.quads, self.weights, self.normals, self.limit, self.entries]
+        device.launch_list(k.copy, self.capacity, [s.frozen, s.entries, *copies])
         if device.wide:
             device.launch_list(k.copy_places, self.capacity, [s.count, s.places, self.places])
 
@@ -302,8 +294,9 @@ class FrictionTerm:
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (friction Hessian) p at free vertices. Recordable."""
         k, device = self.kernels, self.device
-        device.launch_list(k.stretch, self.capacity, [self.count, p, self.quads, self.weights, self.block, self.response])
-        device.launch(k.spread, len(self.ends), [self.source.free, self.ends, self.entries, self.weights, self.response, y])
+        o = self.operand()
+        device.launch_list(k.stretch, self.capacity, [o, p, self.response])
+        device.launch(k.spread, len(self.ends), [o, self.source.free, self.response, y])
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
@@ -315,54 +308,39 @@ class FrictionTerm:
 
     def operand(self):
         """What the functions of `operator` work on."""
-        o = operator(self.real).Operand()
-        for name in ("count", "quads", "weights", "block", "ends", "places", "shares"):
-            setattr(o, name, getattr(self, name))
-        return o
+        return filled(hessian_of(self.real), self)
 
 
 @functools.cache
 def operator(real: Real) -> Operator:
     """As in `exact`."""
-    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    scalar, vec3, Hessian = real.scalar, real.vec3, hessian_of(real)
     feel_pair, total_share = kernels(real).feel, pairs.total_share(real)
 
-    Operand = struct_of(
-        "Operand",
-        __name__,
-        count=wp.array(dtype=wp.int32),
-        quads=wp.array(dtype=wp.vec4i),
-        weights=wp.array(dtype=vec4),
-        block=wp.array(dtype=mat33),
-        ends=wp.array(dtype=wp.int32),
-        places=wp.array(dtype=wp.int32),
-        shares=wp.array(dtype=vec3),
-    )
-
     @func
-    def feel(o: Operand, k: int, p: wp.array(dtype=vec3)) -> scalar:
-        response, work = feel_pair(k, p, o.quads, o.weights, o.block)
+    def feel(o: Hessian, k: int, p: wp.array(dtype=vec3)) -> scalar:
+        response, work = feel_pair(o, k, p)
         for s in range(4):
             o.shares[o.places[4 * k + s]] = o.weights[k][s] * response
         return work
 
     @func
-    def exert(o: Operand, v: int) -> vec3:
+    def exert(o: Hessian, v: int) -> vec3:
         return total_share(v, o.ends, o.shares)
 
-    return Operator(Operand, feel, exert)
+    return Operator(Hessian, feel, exert)
 
 
 @functools.cache
 def assembly(real: Real) -> Kernel:
     """The kernel that fills the rows of the Hessian."""
-    Operand = operator(real).Operand
+    Hessian = hessian_of(real)
 
     @func
-    def block_of(o: Operand, k: int, s: int, t: int) -> real.mat33:
+    def block_of(o: Hessian, k: int, s: int, t: int) -> real.mat33:
         return (o.weights[k][s] * o.weights[k][t]) * o.block[k]
 
-    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Operand, block_of)
+    return contact_rows.assembly(real, real.module(f"{__name__}.assembly"), Hessian, block_of)
 
 
 @functools.cache

@@ -16,6 +16,7 @@ iteration does not work here: after a truncation the frozen gap, and so lambda, 
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -23,16 +24,46 @@ import warp as wp
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
 from pdipc.collision.candidates import SILENT, Candidates
-from pdipc.device.language import Function, func, kernel
+from pdipc.device.language import Function, filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar
 
 FIRST_PAIRS = 1024  # room at first
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
 
 
 @functools.cache
+def frozen(real: Real) -> Any:
+    """A struct: the pairs of an outer iteration as kernels read them."""
+    scalar = real.scalar
+    return struct_of(
+        "Frozen",
+        __name__,
+        count=wp.array(dtype=wp.int32),  # pairs in use; most found; of these vertex-triangle
+        quads=wp.array(dtype=wp.vec4i),
+        weights=wp.array(dtype=real.vec4),  # a
+        normals=wp.array(dtype=real.vec3),  # n
+        gaps=wp.array(dtype=scalar),  # d0, m
+        activation=wp.array(dtype=scalar),  # d_hat, m
+        stiffness=wp.array(dtype=scalar),  # kappa m, N/m
+        coefficient=wp.array(dtype=scalar),  # of friction
+    )
+
+
+@func
+def pair_stiffness(a: Scalar, b: Scalar, mollifier: Scalar):
+    """N/m, of a pair whose sides bring a and b: their mean, since a pair is as stiff as its bodies are heavy; kinematic vertices, which bring 0,
+    have no say.
+    """
+    zero = type(a)(0.0)
+    if a == zero or b == zero:
+        return mollifier * (a + b)
+    return mollifier * type(a)(0.5) * (a + b)
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
+    Frozen = frozen(real)
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     far = wp.constant(real.scalar(1.0e30))
@@ -200,17 +231,10 @@ def kernels(real: Real) -> SimpleNamespace:
             faces: wp.array(dtype=wp.int32),
             gaps: wp.array(dtype=scalar),
             ends: wp.array(dtype=wp.int32),
-            totals: wp.array(dtype=wp.int32),
             kappa: wp.array(dtype=scalar),
             friction: wp.array(dtype=scalar),
             free: wp.array(dtype=scalar),
-            quads_out: wp.array(dtype=wp.vec4i),
-            weights_out: wp.array(dtype=vec4),
-            normals_out: wp.array(dtype=vec3),
-            gaps_out: wp.array(dtype=scalar),
-            activation_out: wp.array(dtype=scalar),
-            stiffness_out: wp.array(dtype=scalar),
-            coefficient_out: wp.array(dtype=scalar),
+            pairs_out: Frozen,
             share_out: wp.array(dtype=scalar),
         ):
             worker = span.first + wp.tid()
@@ -219,10 +243,10 @@ def kernels(real: Real) -> SimpleNamespace:
                 if begin > 0:
                     slot = ends[begin // span.block - 1]
                 if wp.static(edge_edge):
-                    slot += totals[2]
+                    slot += pairs_out.count[2]
                 for k in range(begin, wp.min(begin + span.block, count[0])):
                     d_hat = limits[k][1]
-                    acts = gaps[k] < d_hat and slot < quads_out.shape[0]
+                    acts = gaps[k] < d_hat and slot < pairs_out.quads.shape[0]
                     if wp.static(not edge_edge):  # noqa: SIM102  (known when the kernel is made)
                         if acts:
                             acts = nearest_of_face(k, count[0], quads, faces, gaps)
@@ -243,19 +267,13 @@ def kernels(real: Real) -> SimpleNamespace:
                         r = a[1] * p1 + a[2] * p2 + a[3] * p3
                         n = wp.normalize(r)
                         d0 = gaps[k]
-                        # a pair is as stiff as its bodies are heavy; kinematic vertices have no say
-                        ka = kappa[q[0]]
-                        kb = kappa[q[3]]
-                        stiffness = m * scalar(0.5) * (ka + kb)
-                        if ka == scalar(0.0) or kb == scalar(0.0):
-                            stiffness = m * (ka + kb)
-                        quads_out[slot] = q
-                        weights_out[slot] = a
-                        normals_out[slot] = n
-                        gaps_out[slot] = d0
-                        activation_out[slot] = d_hat
-                        stiffness_out[slot] = stiffness
-                        coefficient_out[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
+                        pairs_out.quads[slot] = q
+                        pairs_out.weights[slot] = a
+                        pairs_out.normals[slot] = n
+                        pairs_out.gaps[slot] = d0
+                        pairs_out.activation[slot] = d_hat
+                        pairs_out.stiffness[slot] = pair_stiffness(kappa[q[0]], kappa[q[3]], m)
+                        pairs_out.coefficient[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
                         share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
                         share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
                         slot += 1
@@ -323,42 +341,39 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def linearize(
         span: Span,
-        count: wp.array(dtype=wp.int32),
+        pairs: Frozen,
         x: wp.array(dtype=vec3),
         x_tilde: wp.array(dtype=vec3),
         x_start: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
-        coefficient: wp.array(dtype=scalar),
         slip_threshold: scalar,
         friction_out: wp.array(dtype=scalar),
         hessian_out: wp.array(dtype=scalar),
         force_out: wp.array(dtype=vec3),
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
-                a = weights[k]
-                n = normals[k]
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
+                q = pairs.quads[k]
+                a = pairs.weights[k]
+                n = pairs.normals[k]
+                gap = pairs.gaps[k]
+                d_hat = pairs.activation[k]
+                stiffness = pairs.stiffness[k]
+                coefficient = pairs.coefficient[k]
                 move = a[0] * (x_tilde[q[0]] - x[q[0]]) + a[1] * (x_tilde[q[1]] - x[q[1]])
                 move += a[2] * (x_tilde[q[2]] - x[q[2]]) + a[3] * (x_tilde[q[3]] - x[q[3]])
-                delta = gaps[k] + wp.dot(n, move)
-                floor = scalar(barrier.EXTENSION) * gaps[k]
-                hessian_out[k] = stiffness[k] * barrier.barrier_hessian(wp.max(delta, floor), activation[k])
-                f = stiffness[k] * barrier.extended_gradient(delta, floor, activation[k])
+                delta = gap + wp.dot(n, move)
+                floor = scalar(barrier.EXTENSION) * gap
+                hessian_out[k] = stiffness * barrier.barrier_hessian(wp.max(delta, floor), d_hat)
+                f = stiffness * barrier.extended_gradient(delta, floor, d_hat)
                 # `force` is what the pair exerts, per unit of witness weight: barrier along n, friction across
                 force = -f * n
                 friction = scalar(0.0)
-                if coefficient[k] > scalar(0.0):
+                if coefficient > scalar(0.0):
                     u = a[0] * (x_tilde[q[0]] - x_start[q[0]]) + a[1] * (x_tilde[q[1]] - x_start[q[1]])
                     u += a[2] * (x_tilde[q[2]] - x_start[q[2]]) + a[3] * (x_tilde[q[3]] - x_start[q[3]])
                     u -= wp.dot(u, n) * n
-                    friction = -coefficient[k] * f * barrier.smoothed_coulomb(wp.length(u), slip_threshold)
+                    friction = -coefficient * f * barrier.smoothed_coulomb(wp.length(u), slip_threshold)
                     force -= friction * u
                 friction_out[k] = friction
                 force_out[k] = force
@@ -368,8 +383,7 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         ends: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         friction: wp.array(dtype=scalar),
         share: wp.array(dtype=scalar),
         hessian: wp.array(dtype=scalar),
@@ -386,8 +400,8 @@ def kernels(real: Real) -> SimpleNamespace:
         d = mat33()
         for i in range(low, ends[v]):
             k = entries[i] // 4
-            w = weights[k][entries[i] % 4]
-            n = normals[k]
+            w = pairs.weights[k][entries[i] % 4]
+            n = pairs.normals[k]
             total += w * force[k]
             scale = wp.abs(w) * share[k]
             d += scale * (hessian[k] - friction[k]) * wp.outer(n, n)
@@ -402,21 +416,18 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def stretch(
         span: Span,
-        count: wp.array(dtype=wp.int32),
+        pairs: Frozen,
         p: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
         friction: wp.array(dtype=scalar),
         hessian: wp.array(dtype=scalar),
         response_out: wp.array(dtype=vec3),
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
-                a = weights[k]
-                n = normals[k]
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
+                q = pairs.quads[k]
+                a = pairs.weights[k]
+                n = pairs.normals[k]
                 u = a[0] * p[q[0]] + a[1] * p[q[1]] + a[2] * p[q[2]] + a[3] * p[q[3]]
                 response_out[k] = (hessian[k] - friction[k]) * wp.dot(n, u) * n + friction[k] * u
 
@@ -442,16 +453,13 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def pair_energy(
         first: int,
-        count: wp.array(dtype=wp.int32),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
+        pairs: Frozen,
         energy_out: wp.array(dtype=scalar),
     ):
         k = first + wp.tid()
         energy_out[k] = scalar(0.0)
-        if k < count[0]:
-            energy_out[k] = stiffness[k] * barrier.barrier(gaps[k], activation[k])
+        if k < pairs.count[0]:
+            energy_out[k] = pairs.stiffness[k] * barrier.barrier(pairs.gaps[k], pairs.activation[k])
 
     return SimpleNamespace(
         total=total,
@@ -529,6 +537,7 @@ class FrozenPairs:
         self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
         self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
         self.coefficient, self.friction = make(real.scalar), make(real.scalar)
+        self.frozen = filled(frozen(real), self)
         self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
@@ -558,10 +567,8 @@ class FrozenPairs:
         ends = [c.ends for c in candidates.lists]
         device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
         for c in candidates.lists:
-            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.ends, self.count]
-            inputs += [self.kappa, self.friction_of_vertex, self.free]
-            inputs += [self.quads, self.weights, self.normals, self.gaps, self.activation]
-            inputs += [self.stiffness, self.coefficient, self.share]
+            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.ends]
+            inputs += [self.kappa, self.friction_of_vertex, self.free, self.frozen, self.share]
             device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
         self._index()
 
@@ -594,11 +601,7 @@ class FrozenPairs:
 
     def energy(self, out: wp.array, slot: int) -> None:
         """out[slot] = sum of kappa m b(d0) over the pairs, in joules. Recordable."""
-        self.device.launch(
-            self.kernels.pair_energy,
-            self.capacity,
-            [self.count, self.gaps, self.activation, self.stiffness, self.energies],
-        )
+        self.device.launch(self.kernels.pair_energy, self.capacity, [self.frozen, self.energies])
         self.energy_sum.sum(self.energies, out, slot)
 
 
@@ -616,10 +619,8 @@ class ActivePairs(FrozenPairs):
 
         x_start: positions at the start of the step, from which slip is measured.
         """
-        k = self.kernels
-        frozen = [self.quads, self.weights, self.normals, self.gaps, self.activation, self.stiffness, self.coefficient]
-        here = [self.slip_threshold, self.friction, self.hessian, self.force]
-        self.device.launch_list(k.linearize, self.capacity, [self.count, x, x_tilde, x_start, *frozen, *here])
+        inputs = [self.frozen, x, x_tilde, x_start, self.slip_threshold, self.friction, self.hessian, self.force]
+        self.device.launch_list(self.kernels.linearize, self.capacity, inputs)
         self.gather(rhs)
 
     def forces(self, x: wp.array) -> wp.array:
@@ -642,13 +643,13 @@ class ActivePairs(FrozenPairs):
 
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
-        inputs = [self.ends, self.entries, self.weights, self.normals, self.friction, self.share, self.hessian, self.force]
+        inputs = [self.ends, self.entries, self.frozen, self.friction, self.share, self.hessian, self.force]
         self.device.launch(self.kernels.gather, len(self.ends), [*inputs, rhs, self.diagonal])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p, pair by pair and gathered per vertex. Recordable."""
         k = self.kernels
-        inputs = [self.count, p, self.quads, self.weights, self.normals, self.friction, self.hessian, self.response]
+        inputs = [self.frozen, p, self.friction, self.hessian, self.response]
         self.device.launch_list(k.stretch, self.capacity, inputs)
         self.device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
 

@@ -26,18 +26,39 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.barrier.exact import BarrierTerm
-from pdipc.barrier.pairs import ActivePairs
-from pdipc.device.language import kernel
+from pdipc.barrier.pairs import ActivePairs, frozen
+from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device, Reducer, Span
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar
 
 SQUARE, CROSS, EXCESS, ELASTIC_START, ELASTIC_END = (wp.constant(place) for place in range(5))  # places of `sums`, J
 WEIGHT = 100.0  # of a pair's constraint, in units of the lighter body's mass / h^2
 
 
+@func
+def parting(before: Scalar, now: Scalar, rigidity: Scalar, restitution: Scalar):
+    """The motion along the normal that a pair should have made in a step, m, and whether it is to be held to that.
+
+    before: the motion that its velocity at the start would have made; now: the one that it made.
+    """
+    one = type(now)(1.0)
+    if before < type(now)(0.0):
+        return restitution * ((one - rigidity) * now - rigidity * before), bool(True)
+    return rigidity * before + (one - rigidity) * (restitution * now + (one - restitution) * before), now > before
+
+
+@func
+def lighter(a: Scalar, b: Scalar):
+    """The lesser of two masses; what is kinematic, and has 0, does not count."""
+    least = wp.min(a, b)
+    if least == type(a)(0.0):
+        return wp.max(a, b)
+    return least
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    scalar, vec3, Frozen = real.scalar, real.vec3, frozen(real)
     mat43 = wp.types.matrix((4, 3), scalar)
     module = real.module(__name__)
 
@@ -52,10 +73,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def aim(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         x_start: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         v_start: wp.array(dtype=vec3),
@@ -70,33 +88,23 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Of each pair: the motion along the normal that it should have made by the end of the step, m, and its weight, N/m."""
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
+                q = pairs.quads[k]
                 before = scalar(0.0)
                 now = scalar(0.0)
                 for s in range(4):
                     i = q[s]
                     moved = x[i] - x_start[i]
-                    now += weights[k][s] * wp.dot(normals[k], moved)
+                    now += pairs.weights[k][s] * wp.dot(pairs.normals[k], moved)
                     if free[i] > scalar(0.0):
                         moved = h * v_start[i]
-                    before += weights[k][s] * wp.dot(normals[k], moved)
-                r = wp.min(rigidity[q[0]], rigidity[q[3]])
-                target = r * before + (scalar(1.0) - r) * (restitution * now + (scalar(1.0) - restitution) * before)
-                engaged = now > before
-                if before < scalar(0.0):
-                    target = restitution * ((scalar(1.0) - r) * now - r * before)
-                    engaged = True
+                    before += pairs.weights[k][s] * wp.dot(pairs.normals[k], moved)
+                target, engaged = parting(before, now, wp.min(rigidity[q[0]], rigidity[q[3]]), restitution)
                 target_out[k] = target
                 pull = scalar(0.0)
                 if engaged:
-                    ma = body_mass[q[0]]
-                    mb = body_mass[q[3]]
-                    lighter = wp.min(ma, mb)
-                    if lighter == scalar(0.0):
-                        lighter = wp.max(ma, mb)
-                    pull = scalar(WEIGHT) * lighter / (h * h)
+                    pull = scalar(WEIGHT) * lighter(body_mass[q[0]], body_mass[q[3]]) / (h * h)
                 if pull > scalar(0.0):
                     needed_out[0] = 1  # whoever writes, writes the same
                 pull_out[k] = pull
@@ -120,10 +128,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def linearize(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         x_start: wp.array(dtype=vec3),
         x_now: wp.array(dtype=vec3),
         target: wp.array(dtype=scalar),
@@ -133,22 +138,19 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out: wp.array(dtype=vec3),
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
                 moved = vec3()
                 for s in range(4):
-                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
+                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
                 friction_out[k] = scalar(0.0)
                 hessian_out[k] = pull[k]
-                force_out[k] = pull[k] * (target[k] - wp.dot(normals[k], moved)) * normals[k]
+                force_out[k] = pull[k] * (target[k] - wp.dot(pairs.normals[k], moved)) * pairs.normals[k]
 
     @kernel(module)
     def linearize_exact(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         x_start: wp.array(dtype=vec3),
         x_now: wp.array(dtype=vec3),
         target: wp.array(dtype=scalar),
@@ -159,16 +161,16 @@ def kernels(real: Real) -> SimpleNamespace:
         hessian_out: wp.array(dtype=scalar),
     ):
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
                 moved = vec3()
                 for s in range(4):
-                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
-                slope = pull[k] * (wp.dot(normals[k], moved) - target[k])
+                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
+                slope = pull[k] * (wp.dot(pairs.normals[k], moved) - target[k])
                 lever = mat43()
                 for s in range(4):
                     for axis in range(3):
-                        lever[s, axis] = weights[k][s] * normals[k][axis]
+                        lever[s, axis] = pairs.weights[k][s] * pairs.normals[k][axis]
                 energy_out[k] = wp.float64(0.0)
                 slope_out[k] = slope * lever
                 lever_out[k] = lever
@@ -225,10 +227,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def keep(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         x_start: wp.array(dtype=vec3),
         x_now: wp.array(dtype=vec3),
         target: wp.array(dtype=scalar),
@@ -238,12 +237,12 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Of each pair: the force along the normal, N, that over the step makes the correction."""
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
                 moved = vec3()
                 for s in range(4):
-                    moved += weights[k][s] * (x_now[quads[k][s]] - x_start[quads[k][s]])
-                rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(normals[k], moved))
+                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
+                rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(pairs.normals[k], moved))
 
     @kernel(module)
     def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):
@@ -301,10 +300,9 @@ class Restitution:
         device.copy(self.u_now, x)
         device.launch_serial(k.clear, [self.needed])
         device.launch(k.forget, p.capacity, [p.rebound])
-        pairs = [p.count, p.quads, p.weights, p.normals]
         motion = [x_start, x, v_start, self.free, self.body_mass, self.rigidity, self.restitution, self.h]
         # `gaps` and `stiffness` of the pairs are of no further use in this step
-        device.launch_list(k.aim, p.capacity, [*pairs, *motion, p.gaps, p.stiffness, self.needed])
+        device.launch_list(k.aim, p.capacity, [p.frozen, *motion, p.gaps, p.stiffness, self.needed])
 
     def inertia(self, x: wp.array, force_out: wp.array, increment_out: wp.array) -> None:
         """Launches the force of M and of the elastic forces at x; and a zero start for the increment."""
@@ -314,8 +312,7 @@ class Restitution:
     def linearize(self, x_start: wp.array, rhs: wp.array) -> None:
         """Adds the pairs' forces to rhs, and makes their Hessian and block diagonal."""
         p = self.pairs
-        pairs = [p.count, p.quads, p.weights, p.normals]
-        inputs = [*pairs, x_start, self.u_now, p.gaps, p.stiffness, p.friction, p.hessian, p.force]
+        inputs = [p.frozen, x_start, self.u_now, p.gaps, p.stiffness, p.friction, p.hessian, p.force]
         self.device.launch_list(self.kernels.linearize, p.capacity, inputs)
         p.gather(rhs)
 
@@ -323,9 +320,8 @@ class Restitution:
         """The pairs' forces and Hessian in the form of `BarrierTerm`, in place of the barrier's."""
         p, k = self.pairs, self.kernels
         assert isinstance(p, BarrierTerm)
-        pairs = [p.count, p.quads, p.weights, p.normals]
         result = [p.energy_of_pair, p.slope, p.lever, p.hessian]
-        self.device.launch_list(k.linearize_exact, p.capacity, [*pairs, x_start, self.u_now, p.gaps, p.stiffness, *result])
+        self.device.launch_list(k.linearize_exact, p.capacity, [p.frozen, x_start, self.u_now, p.gaps, p.stiffness, *result])
         inputs = [p.ends, p.entries, p.quads, p.free, *result]
         self.device.launch(p.exact.gather, len(p.ends), [*inputs, p.force_of_vertex, p.diagonal, p.energy_of_vertex])
 
@@ -338,6 +334,6 @@ class Restitution:
             self.reducer.sum(values, self.sums, place)
         device.launch_serial(k.limit, [self.sums, self.part])
         p = self.pairs
-        pairs = [p.count, p.quads, p.weights, p.normals]
-        device.launch_list(k.keep, p.capacity, [*pairs, x_start, self.u_now, p.gaps, p.stiffness, self.part, p.rebound])
+        inputs = [p.frozen, x_start, self.u_now, p.gaps, p.stiffness, self.part, p.rebound]
+        device.launch_list(k.keep, p.capacity, inputs)
         device.launch(k.shorten, n, [x, self.part, self.u_now])

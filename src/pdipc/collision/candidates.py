@@ -21,6 +21,7 @@ What happens between two primitives that are farther apart than xi + d_hat all t
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,9 +29,9 @@ import warp as wp
 from pdipc.collision import distance, sieve
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
-from pdipc.device.language import func, kernel
+from pdipc.device.language import func, kernel, struct_of
 from pdipc.device.launch import Device, Largest, Span
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
 ROUNDING = 1.0e-5  # relative, of all that a reach is made of
@@ -41,40 +42,51 @@ REST_SEPARATION = 0.2  # and keeps at least this fraction of that distance as mi
 ROD_SEPARATION = 0.7  # the same of rods, which are as thick as their radius also where they touch themselves
 
 
+@func
+def of_one_body(xi: Scalar, d_hat: Scalar, part: Scalar, rest_distance: Scalar):
+    """(xi, d_hat) of a pair of one body: at most parts of its distance in the rest shape, so that rest is at rest."""
+    kept = wp.min(xi, part * rest_distance)
+    return kept, wp.min(d_hat, type(xi)(REST_FRACTION) * rest_distance - kept)
+
+
+@functools.cache
+def vertices(real: Real) -> Any:
+    """A struct: what pairs take their limits from."""
+    return struct_of(
+        "Vertices",
+        __name__,
+        d_hat=real.scalar,  # m
+        body=wp.array(dtype=wp.int32),  # of each vertex
+        rest=wp.array(dtype=real.vec3),  # m, where it is at rest
+        half_separation=wp.array(dtype=real.scalar),  # m
+        rest_separation=wp.array(dtype=real.scalar),  # the part of its distance at rest that a pair of one body keeps at most
+        inner_vertex=wp.array(dtype=wp.int32),  # whether it is inside a flat face
+        flat=wp.array(dtype=wp.int32),  # of each body, whether it has the shape that these were found in
+        ignored=wp.array(dtype=wp.vec2i),  # pairs of bodies that ignore each other
+    )
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
+    scalar, vec2, vec3, Vertices = real.scalar, real.vec2, real.vec3, vertices(real)
     module = real.module(__name__)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
     nothing = wp.constant(scalar(IGNORED))
     silent = wp.constant(SILENT)
 
     @func
-    def limits(
-        a: int,
-        b: int,
-        rest_distance: scalar,
-        half_separation: wp.array(dtype=scalar),
-        rest_separation: wp.array(dtype=scalar),
-        d_hat: scalar,
-        body: wp.array(dtype=wp.int32),
-        ignored: wp.array(dtype=wp.vec2i),
-    ):
-        """(xi, d_hat) of a pair: smaller for a pair of one body that is close in the rest shape, so that rest is at rest; IGNORED for a
-        pair of two bodies that ignore each other.
-        """
-        low = wp.min(body[a], body[b])
-        high = wp.max(body[a], body[b])
-        same = low == high
-        for i in range(ignored.shape[0]):
-            if ignored[i][0] == low and ignored[i][1] == high:
+    def limits(o: Vertices, a: int, b: int, rest_distance: scalar):
+        """(xi, d_hat) of a pair; IGNORED for a pair of two bodies that ignore each other."""
+        low = wp.min(o.body[a], o.body[b])
+        high = wp.max(o.body[a], o.body[b])
+        for i in range(o.ignored.shape[0]):
+            if o.ignored[i][0] == low and o.ignored[i][1] == high:
                 return vec2(scalar(0.0), nothing)
-        xi = half_separation[a] + half_separation[b]
-        reach = d_hat
-        if same:
-            xi = wp.min(xi, rest_separation[a] * rest_distance)
-            reach = wp.min(reach, scalar(REST_FRACTION) * rest_distance - xi)
-        return vec2(xi, reach)
+        xi = o.half_separation[a] + o.half_separation[b]
+        if low == high:
+            kept, reach = of_one_body(xi, o.d_hat, o.rest_separation[a], rest_distance)
+            return vec2(kept, reach)
+        return vec2(xi, o.d_hat)
 
     @kernel(module)
     def vertex_triangle_limits(
@@ -82,15 +94,8 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         pairs: wp.array(dtype=wp.vec2i),
         triangles: wp.array(dtype=wp.vec3i),
-        body: wp.array(dtype=wp.int32),
-        rest: wp.array(dtype=vec3),
-        half_separation: wp.array(dtype=scalar),
-        rest_separation: wp.array(dtype=scalar),
-        d_hat: scalar,
-        ignored: wp.array(dtype=wp.vec2i),
-        flat: wp.array(dtype=wp.int32),
+        o: Vertices,
         face: wp.array(dtype=wp.int32),
-        inner_vertex: wp.array(dtype=wp.int32),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
         faces_out: wp.array(dtype=wp.int32),
@@ -103,14 +108,16 @@ def kernels(real: Real) -> SimpleNamespace:
                 quads_out[k] = wp.vec4i(v, t[0], t[1], t[2])
                 rest_distance = scalar(0.0)
                 faces_out[k] = -1
-                if body[v] != body[t[0]]:
-                    if flat[body[v]] * inner_vertex[v] > 0:
+                if o.body[v] != o.body[t[0]]:
+                    if o.flat[o.body[v]] * o.inner_vertex[v] > 0:
                         faces_out[k] = silent
-                    elif flat[body[t[0]]] > 0:
+                    elif o.flat[o.body[t[0]]] > 0:
                         faces_out[k] = face[pairs[k][1]]
                 else:
-                    rest_distance = scalar(distance.vertex_triangle_distance(rest[v], rest[t[0]], rest[t[1]], rest[t[2]]))
-                limits_out[k] = limits(v, t[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
+                    rest_distance = scalar(
+                        distance.vertex_triangle_distance(o.rest[v], o.rest[t[0]], o.rest[t[1]], o.rest[t[2]])
+                    )
+                limits_out[k] = limits(o, v, t[0], rest_distance)
 
     @kernel(module)
     def edge_edge_limits(
@@ -118,15 +125,8 @@ def kernels(real: Real) -> SimpleNamespace:
         count: wp.array(dtype=wp.int32),
         pairs: wp.array(dtype=wp.vec2i),
         edges: wp.array(dtype=wp.vec2i),
-        body: wp.array(dtype=wp.int32),
-        rest: wp.array(dtype=vec3),
-        half_separation: wp.array(dtype=scalar),
-        rest_separation: wp.array(dtype=scalar),
-        d_hat: scalar,
-        ignored: wp.array(dtype=wp.vec2i),
-        flat: wp.array(dtype=wp.int32),
+        o: Vertices,
         inner: wp.array(dtype=wp.int32),
-        _inner_vertex: wp.array(dtype=wp.int32),
         quads_out: wp.array(dtype=wp.vec4i),
         limits_out: wp.array(dtype=vec2),
         faces_out: wp.array(dtype=wp.int32),
@@ -139,12 +139,12 @@ def kernels(real: Real) -> SimpleNamespace:
                 quads_out[k] = wp.vec4i(a[0], a[1], b[0], b[1])
                 rest_distance = scalar(0.0)
                 faces_out[k] = -1
-                if body[a[0]] != body[b[0]]:
-                    if flat[body[a[0]]] * inner[pairs[k][0]] + flat[body[b[0]]] * inner[pairs[k][1]] > 0:
+                if o.body[a[0]] != o.body[b[0]]:
+                    if o.flat[o.body[a[0]]] * inner[pairs[k][0]] + o.flat[o.body[b[0]]] * inner[pairs[k][1]] > 0:
                         faces_out[k] = silent
                 else:
-                    rest_distance = scalar(distance.edge_edge_distance(rest[a[0]], rest[a[1]], rest[b[0]], rest[b[1]]))
-                limits_out[k] = limits(a[0], b[0], rest_distance, half_separation, rest_separation, d_hat, body, ignored)
+                    rest_distance = scalar(distance.edge_edge_distance(o.rest[a[0]], o.rest[a[1]], o.rest[b[0]], o.rest[b[1]]))
+                limits_out[k] = limits(o, a[0], b[0], rest_distance)
 
     @func
     def near(x: vec3, y: vec3, margin: scalar) -> bool:
@@ -328,11 +328,13 @@ class Candidates:
         them at the same fraction of it."""
         self.device.launch(self.kernels.keep, len(x0), [x0, x1, self.begin, self.end])
         self.broad_phase.find(self.begin, self.end, self.reach, self.sieve)
-        common = [self.surface.body_of_vertex, self.rest, self.half_separation]
-        common += [self.rest_separation, self.activation_distance, self.ignored, self.flat]
+        o = vertices(self.real)()
+        o.d_hat, o.body, o.rest = self.activation_distance, self.surface.body_of_vertex, self.rest
+        o.half_separation, o.rest_separation = self.half_separation, self.rest_separation
+        o.inner_vertex, o.flat, o.ignored = self.surface.inner_vertex, self.flat, self.ignored
         primitives = ((self.surface.triangles, self.surface.face), (self.surface.edges, self.surface.inner_edge))
         for own, found, (of, flat) in zip(self.lists, self.broad_phase.lists, primitives, strict=True):
-            inputs = [found.count, found.pairs, of, *common, flat, self.surface.inner_vertex, own.quads, own.limits, own.faces]
+            inputs = [found.count, found.pairs, of, o, flat, own.quads, own.limits, own.faces]
             self.device.launch_list(getattr(self.kernels, f"{own.kind}_limits"), own.capacity, inputs)
 
     def check(self, x0: wp.array, x1: wp.array) -> None:

@@ -13,8 +13,7 @@ import warp as wp
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.device.precision import Mat33, Real, Scalar, Vec3
 
 NAME = "corotated"
 CORNERS = tets.CORNERS
@@ -27,48 +26,41 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, mu, lame) -> Constrai
     return tets.make(NAME, rest_positions, vertices, mu, 1.0, np.asarray(lame) / mu)
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """stress, principal and density, over mu; the argument `lame` is lambda / mu."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    one, two = wp.constant(scalar(1.0)), wp.constant(scalar(2.0))
-    least = wp.constant(scalar(1.0e-6))
-    rot = rotation.functions(real)
-    cofactor, nearest_rotation = rot.cofactor, rot.nearest_rotation
+@func
+def stress(f: Mat33, mu: Scalar, lame: Scalar):
+    """Over mu, as all here; lame: lambda / mu."""
+    c = rotation.cofactor(f)
+    j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
+    return type(mu)(2.0) * mu * (f - rotation.nearest_rotation(f)) + lame * (j - type(mu)(1.0)) * c
 
-    @func
-    def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
-        c = cofactor(f)
-        j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
-        return two * mu * (f - nearest_rotation(f)) + lame * (j - one) * c
 
-    @func
-    def principal(s: vec3, mu: scalar, lame: scalar):
-        c = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-        m = two * mu
-        pressure = lame * (s[0] * c[0] - one)
-        stretch = mat33(
-            m + lame * c[0] * c[0], lame * c[0] * c[1] + pressure * s[2], lame * c[0] * c[2] + pressure * s[1],
-            lame * c[0] * c[1] + pressure * s[2], m + lame * c[1] * c[1], lame * c[1] * c[2] + pressure * s[0],
-            lame * c[0] * c[2] + pressure * s[1], lame * c[1] * c[2] + pressure * s[0], m + lame * c[2] * c[2],
-        )  # fmt: skip
-        turned = vec3(
-            one - two / wp.max(s[1] + s[2], least),
-            one - two / wp.max(s[0] + s[2], least),
-            one - two / wp.max(s[0] + s[1], least),
-        )
-        return stretch, m * turned + pressure * s, vec3(m, m, m) - pressure * s
+@func
+def principal(s: Vec3, mu: Scalar, lame: Scalar):
+    one, two, least = type(mu)(1.0), type(mu)(2.0), type(mu)(1.0e-6)
+    c = type(s)(s[1] * s[2], s[0] * s[2], s[0] * s[1])
+    m = two * mu
+    pressure = lame * (s[0] * c[0] - one)
+    both = wp.outer(c, c)
+    stretch = type(both)(
+        m + lame * c[0] * c[0], lame * c[0] * c[1] + pressure * s[2], lame * c[0] * c[2] + pressure * s[1],
+        lame * c[0] * c[1] + pressure * s[2], m + lame * c[1] * c[1], lame * c[1] * c[2] + pressure * s[0],
+        lame * c[0] * c[2] + pressure * s[1], lame * c[1] * c[2] + pressure * s[0], m + lame * c[2] * c[2],
+    )  # fmt: skip
+    turned = type(s)(
+        one - two / wp.max(s[1] + s[2], least),
+        one - two / wp.max(s[0] + s[2], least),
+        one - two / wp.max(s[0] + s[1], least),
+    )
+    return stretch, m * turned + pressure * s, type(s)(m, m, m) - pressure * s
 
-    @func
-    def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
-        d = f - nearest_rotation(f)
-        j = wp.determinant(f) - one
-        return mu * wp.ddot(d, d) + scalar(0.5) * lame * j * j
 
-    return SimpleNamespace(stress=stress, principal=principal, density=density)
+@func
+def density(f: Mat33, mu: Scalar, lame: Scalar):
+    d = f - rotation.nearest_rotation(f)
+    j = wp.determinant(f) - type(mu)(1.0)
+    return mu * wp.ddot(d, d) + type(mu)(0.5) * lame * j * j
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    wide = functions(real_of("float64"))
-    return tets.kernels(real, real.module(__name__), wide.stress, functions(real).principal, wide.density)
+    return tets.kernels(real, real.module(__name__), stress, principal, density)

@@ -58,52 +58,52 @@ def rest(triangles: np.ndarray, cavity: np.ndarray, law: np.ndarray) -> Constrai
     return make_set(NAME, triangles, np.zeros((len(triangles), 1, 3)), 1.0, cavity=np.asarray(cavity), law=law)
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """overpressure(V, law), stiffness = dq/dV with its sign turned, and energy(V, from, law), all in double precision."""
-    wide = wp.float64
-    law_type = wp.types.vector(LAW, wide)
-    one, least = wp.constant(wide(1.0)), wp.constant(wide(LEAST))
+wide = wp.float64
+Law = wp.types.vector(LAW, wide)
+one, least = wp.constant(wide(1.0)), wp.constant(wide(LEAST))
 
-    @func
-    def overpressure(volume: wide, law: law_type) -> wide:
-        part = wp.max(volume / law[4], least)
-        return law[0] + law[1] * wp.pow(part, -law[2]) + law[3] * (one - part)
 
-    @func
-    def stiffness(volume: wide, law: law_type) -> wide:
-        part = wp.max(volume / law[4], least)
-        return (law[1] * law[2] * wp.pow(part, -law[2] - one) + law[3]) / law[4]
+@func
+def overpressure(volume: wide, law: Law) -> wide:
+    part = wp.max(volume / law[4], least)
+    return law[0] + law[1] * wp.pow(part, -law[2]) + law[3] * (one - part)
 
-    @func
-    def log1p(x: wide) -> wide:
-        """ln(1 + x) as exact as x (Kahan)."""
-        y = one + x
-        if y == one:
-            return x
-        return wp.log(y) * x / (y - one)
 
-    @func
-    def expm1(x: wide) -> wide:
-        y = wp.exp(x)
-        if y == one or y - one == -one:
-            return wp.where(y == one, x, -one)
-        return (y - one) * x / wp.log(y)
+@func
+def stiffness(volume: wide, law: Law) -> wide:
+    part = wp.max(volume / law[4], least)
+    return (law[1] * law[2] * wp.pow(part, -law[2] - one) + law[3]) / law[4]
 
-    @func
-    def energy(volume: wide, reference: wide, law: law_type) -> wide:
-        """W(volume) - W(reference), as exact as the change of volume: gas and what it works against all but cancel."""
-        r = reference / law[4]
-        change = wp.max(volume / reference, least) - one
-        grown = log1p(change)
-        gas = grown
-        if law[2] != one:
-            gas = expm1((one - law[2]) * grown) / (one - law[2])
-        gas = law[1] * wp.pow(r, -law[2]) * gas
-        liquid = wide(0.5) * law[3] * change * (r * change + wide(2.0) * (r - one))
-        return reference * (liquid - law[0] * change - gas)
 
-    return SimpleNamespace(overpressure=overpressure, stiffness=stiffness, energy=energy, law=law_type)
+@func
+def log1p(x: wide) -> wide:
+    """ln(1 + x) as exact as x (Kahan)."""
+    y = one + x
+    if y == one:
+        return x
+    return wp.log(y) * x / (y - one)
+
+
+@func
+def expm1(x: wide) -> wide:
+    y = wp.exp(x)
+    if y == one or y - one == -one:
+        return wp.where(y == one, x, -one)
+    return (y - one) * x / wp.log(y)
+
+
+@func
+def pressure_energy(volume: wide, reference: wide, law: Law) -> wide:
+    """W(volume) - W(reference), as exact as the change of volume: gas and what it works against all but cancel."""
+    r = reference / law[4]
+    change = wp.max(volume / reference, least) - one
+    grown = log1p(change)
+    gas = grown
+    if law[2] != one:
+        gas = expm1((one - law[2]) * grown) / (one - law[2])
+    gas = law[1] * wp.pow(r, -law[2]) * gas
+    liquid = wide(0.5) * law[3] * change * (r * change + wide(2.0) * (r - one))
+    return reference * (liquid - law[0] * change - gas)
 
 
 class Cavities:
@@ -133,7 +133,7 @@ class Cavities:
         self.vertices = upload(s.vertices, wp.vec3i)
         self.number, self.leader = upload(number.astype(np.int32), wp.int32), upload(leader.astype(np.int32), wp.int32)
         self.first = upload(self.names.astype(np.int32), wp.int32)
-        self.laws = upload(s.data["law"][first], functions(real).law)
+        self.laws = upload(s.data["law"][first], Law)
         self.volume, self.pressure, self.energy = zeros(wp.float64), zeros(real.scalar), zeros(wp.float64)
         self.reference = zeros(wp.float64)
         self.stiffness, self._stiffness, self._dots = zeros(real.scalar), zeros(real.scalar), zeros(wp.float64)
@@ -197,8 +197,7 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
     module = real.module(__name__)
-    edges, law_of = tets.functions(real), functions(real)
-    wide, law_type = wp.float64, functions(real).law
+    edges = tets.functions(real)
     sixth = wp.constant(scalar(1.0 / 6.0))
 
     @func
@@ -235,16 +234,16 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         count: int,
         volume: wp.array(dtype=wide),
-        laws: wp.array(dtype=law_type),
+        laws: wp.array(dtype=Law),
         reference: wp.array(dtype=wide),
         pressure_out: wp.array(dtype=scalar),
         stiffness_out: wp.array(dtype=scalar),
         energy_out: wp.array(dtype=wide),
     ):
         for c in range(count):
-            pressure_out[c] = scalar(law_of.overpressure(volume[c], laws[c]))
-            stiffness_out[c] = scalar(law_of.stiffness(volume[c], laws[c]))
-            energy_out[c] = law_of.energy(volume[c], wp.where(reference[c] > wide(0.0), reference[c], laws[c][4]), laws[c])
+            pressure_out[c] = scalar(overpressure(volume[c], laws[c]))
+            stiffness_out[c] = scalar(stiffness(volume[c], laws[c]))
+            energy_out[c] = pressure_energy(volume[c], wp.where(reference[c] > wide(0.0), reference[c], laws[c][4]), laws[c])
 
     @kernel(module)
     def force(

@@ -16,12 +16,12 @@ import warp as wp
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.device.precision import Mat33, Real, Scalar, Vec3
 
 NAME = "neo_hookean"
 CORNERS = tets.CORNERS
 PROJECTIVE = False
+M, SHIFT = 4.0 / 3.0, 5.0 / 6.0
 arguments = tets.arguments
 
 
@@ -30,70 +30,70 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, mu, lame) -> Constrai
     return tets.make(NAME, rest_positions, vertices, mu, 1.0, np.asarray(lame) / mu)
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """stress, principal, invariants and density, over mu; the argument `lame` is lambda / mu."""
-    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
-    one, half = wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
-    m, shift = wp.constant(scalar(4.0 / 3.0)), wp.constant(scalar(5.0 / 6.0))
-    cofactor = rotation.functions(real).cofactor
+@func
+def stress(f: Mat33, mu: Scalar, lame: Scalar):
+    """Over mu, as all here; lame: lambda / mu."""
+    one = type(mu)(1.0)
+    c = rotation.cofactor(f)
+    j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
+    spring = type(mu)(M) * mu * (one - one / (wp.ddot(f, f) + one))
+    return spring * f + ((lame + type(mu)(SHIFT) * mu) * (j - one) - mu) * c
 
-    @func
-    def stress(f: mat33, mu: scalar, lame: scalar) -> mat33:
-        c = cofactor(f)
-        j = f[0, 0] * c[0, 0] + f[1, 0] * c[1, 0] + f[2, 0] * c[2, 0]
-        spring = m * mu * (one - one / (wp.ddot(f, f) + one))
-        return spring * f + ((lame + shift * mu) * (j - one) - mu) * c
 
-    @func
-    def principal(s: vec3, mu: scalar, lame: scalar):
-        c = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-        k = lame + shift * mu
-        pressure = k * (s[0] * c[0] - one) - mu
-        fade = one / (wp.dot(s, s) + one)
-        spring = m * mu * (one - fade)
-        stretch = k * wp.outer(c, c) + (scalar(2.0) * m * mu * fade * fade) * wp.outer(s, s) + mat33(
-            spring, pressure * s[2], pressure * s[1],
-            pressure * s[2], spring, pressure * s[0],
-            pressure * s[1], pressure * s[0], spring,
-        )  # fmt: skip
-        side = pressure * s
-        each = vec3(spring, spring, spring)
-        return stretch, each + side, each - side
+@func
+def principal(s: Vec3, mu: Scalar, lame: Scalar):
+    one, m = type(mu)(1.0), type(mu)(M)
+    c = type(s)(s[1] * s[2], s[0] * s[2], s[0] * s[1])
+    k = lame + type(mu)(SHIFT) * mu
+    pressure = k * (s[0] * c[0] - one) - mu
+    fade = one / (wp.dot(s, s) + one)
+    spring = m * mu * (one - fade)
+    both = wp.outer(c, c)
+    stretch = k * both + (type(mu)(2.0) * m * mu * fade * fade) * wp.outer(s, s) + type(both)(
+        spring, pressure * s[2], pressure * s[1],
+        pressure * s[2], spring, pressure * s[0],
+        pressure * s[1], pressure * s[0], spring,
+    )  # fmt: skip
+    side = pressure * s
+    each = type(s)(spring, spring, spring)
+    return stretch, each + side, each - side
 
-    @func
-    def invariants(f: mat33, mu: scalar, lame: scalar) -> vec4:
-        k = lame + shift * mu
-        fade = one / (wp.ddot(f, f) + one)
-        return vec4(m * mu * (one - fade), scalar(2.0) * m * mu * fade * fade, k, k * (wp.determinant(f) - one) - mu)
 
-    @func
-    def density(f: mat33, mu: scalar, lame: scalar) -> scalar:
-        """All terms of first order cancel at rest, and are left out where J > 0, since of them rounding of mu would be left: in terms of
-        C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.
-        """
-        c = wp.transpose(f) * f - wp.identity(n=3, dtype=scalar)
-        trace = wp.trace(c)
-        minors = half * (trace * trace - wp.ddot(c, c)) + wp.determinant(c)
-        j = wp.determinant(f) - one
-        shear = half * trace - j
-        if j > -one:
-            j = (trace + minors) / (j + scalar(2.0))
-            shear = (half * trace * j - minors) / (j + scalar(2.0))
-        # y - log(1 + y), accurately where y is small
-        y = scalar(0.25) * trace
-        w = one + y
-        bent = scalar(0.0)
-        if w != one:
-            bent = y * (one - wp.log(w) / (w - one))
-        return mu * shear + half * m * mu * bent + half * (lame + shift * mu) * j * j
+@func
+def invariants(f: Mat33, mu: Scalar, lame: Scalar):
+    one, m = type(mu)(1.0), type(mu)(M)
+    k = lame + type(mu)(SHIFT) * mu
+    fade = one / (wp.ddot(f, f) + one)
+    return wp.vector(m * mu * (one - fade), type(mu)(2.0) * m * mu * fade * fade, k, k * (wp.determinant(f) - one) - mu)
 
-    return SimpleNamespace(stress=stress, principal=principal, invariants=invariants, density=density)
+
+@func
+def density(f: Mat33, mu: Scalar, lame: Scalar):
+    """All terms of first order cancel at rest, and are left out where J > 0, since of them rounding of mu would be left: in terms of
+    C = F^T F - I, |F|^2 - 3 = tr C and J - 1 = (J^2 - 1) / (J + 1), J^2 - 1 = tr C + (the sum of its principal minors) + det C.
+    """
+    one, half = type(mu)(1.0), type(mu)(0.5)
+    c = wp.transpose(f) * f
+    for i in range(3):
+        c[i, i] -= one
+    trace = wp.trace(c)
+    minors = half * (trace * trace - wp.ddot(c, c)) + wp.determinant(c)
+    j = wp.determinant(f) - one
+    shear = half * trace - j
+    if j > -one:
+        j = (trace + minors) / (j + type(mu)(2.0))
+        shear = (half * trace * j - minors) / (j + type(mu)(2.0))
+    # y - log(1 + y), accurately where y is small
+    y = type(mu)(0.25) * trace
+    w = one + y
+    bent = type(mu)(0.0)
+    if w != one:
+        bent = y * (one - wp.log(w) / (w - one))
+    return mu * shear + half * type(mu)(M) * mu * bent + half * (lame + type(mu)(SHIFT) * mu) * j * j
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    wide, own = functions(real_of("float64")), functions(real)
     # in single precision the terms of the invariants leave more of a rigid rotation than inertia bears; see `tests.linear.test_blocks`
-    invariants = own.invariants if real.name == "float64" else None
-    return tets.kernels(real, real.module(__name__), wide.stress, own.principal, wide.density, invariants)
+    of_invariants = invariants if real.name == "float64" else None
+    return tets.kernels(real, real.module(__name__), stress, principal, density, of_invariants)

@@ -30,7 +30,6 @@ from pdipc.constraints.base import ConstraintSet, make_set
 from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
 
 NAME = "rod_frames"
 CORNERS = 5
@@ -68,109 +67,128 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
     return [rotation, wp.array(s.data["stiffness"], dtype=wp.vec3d, device=device.warp)]
 
 
+wide, wide3, wide4, wide33 = wp.float64, wp.vec3d, wp.vec4d, wp.mat33d
+zero, half, one, two = (wp.constant(wide(value)) for value in (0.0, 0.5, 1.0, 2.0))
+
+
+@struct
+class Segment:
+    e: wp.vec3d
+    w: wp.vec3d
+    d: wp.mat33d  # d1, d2 and t in columns
+    length: wp.float64  # |e|
+    along: wp.float64  # w . t
+    across: wp.float64  # w . d1
+
+
+@func
+def column(m: wide33, k: int) -> wide3:
+    return wide3(m[0, k], m[1, k], m[2, k])
+
+
+@func
+def segment(e: wide3, away: wide3):
+    """Along e, with its ghost at `away` from where it begins, both m."""
+    s = Segment()
+    s.e = e
+    s.w = away - half * s.e
+    s.length = wp.length(s.e)
+    t = s.e / s.length
+    s.along = wp.dot(s.w, t)
+    d1 = s.w - s.along * t
+    s.across = wp.max(wp.length(d1), wide(1.0e-30))
+    d1 = d1 / s.across
+    s.d = wp.matrix_from_cols(d1, wp.cross(t, d1), t)
+    return s
+
+
+@func
+def coupling(r: wide33, c: wide3) -> wide33:
+    """M."""
+    return half * (r * wp.diag(c) + wp.diag(c) * r)
+
+
+@func
+def axial(n: wide33) -> wide3:
+    return wide3(n[1, 2] - n[2, 1], n[2, 0] - n[0, 2], n[0, 1] - n[1, 0])
+
+
+@func
+def along_segment(s: Segment, torque: wide3) -> wide3:
+    """The transpose of omega(de), applied to a torque."""
+    t = column(s.d, 2)
+    twist = wp.dot(torque, t) * s.along / (s.length * s.across)
+    return wp.cross(torque, t) / s.length - twist * column(s.d, 1)
+
+
+@func
+def across_segment(s: Segment, torque: wide3) -> wide3:
+    """The transpose of omega(dw), applied to a torque."""
+    return (wp.dot(torque, column(s.d, 2)) / s.across) * column(s.d, 1)
+
+
+@func
+def turning(s: Segment):
+    """omega(de) and omega(dw) as matrices."""
+    t = column(s.d, 2)
+    d2 = column(s.d, 1)
+    by_edge = wp.skew(t) / s.length - (s.along / (s.length * s.across)) * wp.outer(t, d2)
+    return by_edge, wp.outer(t, d2) / s.across
+
+
+@func
+def both(a: wide3, b: wide3) -> wide33:
+    return half * (wp.outer(a, b) + wp.outer(b, a))
+
+
+@func
+def bent(s: Segment, torque: wide3):
+    """torque . (what omega changes by): the blocks of de de, de dw and dw dw."""
+    d1 = column(s.d, 0)
+    d2 = column(s.d, 1)
+    t = column(s.d, 2)
+    t1 = wp.dot(torque, d1)
+    t2 = wp.dot(torque, d2)
+    t3 = wp.dot(torque, t)
+    c = one / s.length
+    k = s.along / s.across
+    ee = -two * t2 * both(t, d1) + two * t1 * both(t, d2) - k * (t1 * both(d1, d2) + t2 * both(d2, d2))
+    ee += t3 * (two * k * both(d2, t) - (one + two * k * k) * both(d1, d2))
+    ew = wp.outer(t1 * d1 + t2 * d2, d2) + t3 * (two * k * (wp.outer(d2, d1) + wp.outer(d1, d2)) - two * wp.outer(d2, t))
+    ww = (-two * t3 / (s.across * s.across)) * both(d1, d2)
+    return (c * c) * ee, (half * c / s.across) * ew, ww
+
+
+@func
+def mirrored(m: wide33) -> wide33:
+    """Symmetric: what is below the diagonal as above it."""
+    return wide33(
+        m[0, 0], m[0, 1], m[0, 2],
+        m[0, 1], m[1, 1], m[1, 2],
+        m[0, 2], m[1, 2], m[2, 2],
+    )  # fmt: skip
+
+
+@func
+def plus(total: wide33, part: wide, to: wide4, a: wide33, b: wide33, c: wide33, d: wide33) -> wide33:
+    """total + part (to_0 a + to_1 b + to_2 c + to_3 d), one after the other."""
+    total = total + (part * to[0]) * a
+    total = total + (part * to[1]) * b
+    total = total + (part * to[2]) * c
+    return total + (part * to[3]) * d
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    wide, wide3, wide4, wide33 = wp.float64, wp.vec3d, wp.vec4d, wp.mat33d
     module = real.module(__name__)
     element = wp.types.vector(CORNERS, wp.int32)
-    edges, symmetric = tets.functions(real), eigen.functions(real_of("float64")).symmetric
+    edges = tets.functions(real)
     table = wp.types.matrix((4, CORNERS), wide)
-    zero, half, one, two = (wp.constant(wide(value)) for value in (0.0, 0.5, 1.0, 2.0))
-
-    @struct
-    class Segment:
-        e: wp.vec3d
-        w: wp.vec3d
-        d: wp.mat33d  # d1, d2 and t in columns
-        length: wp.float64  # |e|
-        along: wp.float64  # w . t
-        across: wp.float64  # w . d1
 
     @func
-    def column(m: wide33, k: int) -> wide3:
-        return wide3(m[0, k], m[1, k], m[2, k])
-
-    @func
-    def segment(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), i: int, j: int, g: int) -> Segment:
-        s = Segment()
-        s.e = edges.wide_edge(base, u, i, j)
-        s.w = edges.wide_edge(base, u, i, g) - half * s.e
-        s.length = wp.length(s.e)
-        t = s.e / s.length
-        s.along = wp.dot(s.w, t)
-        d1 = s.w - s.along * t
-        s.across = wp.max(wp.length(d1), wide(1.0e-30))
-        d1 = d1 / s.across
-        s.d = wp.matrix_from_cols(d1, wp.cross(t, d1), t)
-        return s
-
-    @func
-    def coupling(r: wide33, c: wide3) -> wide33:
-        """M."""
-        return half * (r * wp.diag(c) + wp.diag(c) * r)
-
-    @func
-    def axial(n: wide33) -> wide3:
-        return wide3(n[1, 2] - n[2, 1], n[2, 0] - n[0, 2], n[0, 1] - n[1, 0])
-
-    @func
-    def along_segment(s: Segment, torque: wide3) -> wide3:
-        """The transpose of omega(de), applied to a torque."""
-        t = column(s.d, 2)
-        twist = wp.dot(torque, t) * s.along / (s.length * s.across)
-        return wp.cross(torque, t) / s.length - twist * column(s.d, 1)
-
-    @func
-    def across_segment(s: Segment, torque: wide3) -> wide3:
-        """The transpose of omega(dw), applied to a torque."""
-        return (wp.dot(torque, column(s.d, 2)) / s.across) * column(s.d, 1)
-
-    @func
-    def turning(s: Segment):
-        """omega(de) and omega(dw) as matrices."""
-        t = column(s.d, 2)
-        d2 = column(s.d, 1)
-        by_edge = wp.skew(t) / s.length - (s.along / (s.length * s.across)) * wp.outer(t, d2)
-        return by_edge, wp.outer(t, d2) / s.across
-
-    @func
-    def both(a: wide3, b: wide3) -> wide33:
-        return half * (wp.outer(a, b) + wp.outer(b, a))
-
-    @func
-    def bent(s: Segment, torque: wide3):
-        """torque . (what omega changes by): the blocks of de de, de dw and dw dw."""
-        d1 = column(s.d, 0)
-        d2 = column(s.d, 1)
-        t = column(s.d, 2)
-        t1 = wp.dot(torque, d1)
-        t2 = wp.dot(torque, d2)
-        t3 = wp.dot(torque, t)
-        c = one / s.length
-        k = s.along / s.across
-        ee = -two * t2 * both(t, d1) + two * t1 * both(t, d2) - k * (t1 * both(d1, d2) + t2 * both(d2, d2))
-        ee += t3 * (two * k * both(d2, t) - (one + two * k * k) * both(d1, d2))
-        ew = wp.outer(t1 * d1 + t2 * d2, d2) + t3 * (two * k * (wp.outer(d2, d1) + wp.outer(d1, d2)) - two * wp.outer(d2, t))
-        ww = (-two * t3 / (s.across * s.across)) * both(d1, d2)
-        return (c * c) * ee, (half * c / s.across) * ew, ww
-
-    @func
-    def mirrored(m: wide33) -> wide33:
-        """Symmetric: what is below the diagonal as above it."""
-        return wide33(
-            m[0, 0], m[0, 1], m[0, 2],
-            m[0, 1], m[1, 1], m[1, 2],
-            m[0, 2], m[1, 2], m[2, 2],
-        )  # fmt: skip
-
-    @func
-    def plus(total: wide33, part: wide, to: wide4, a: wide33, b: wide33, c: wide33, d: wide33) -> wide33:
-        """total + part (to_0 a + to_1 b + to_2 c + to_3 d), one after the other."""
-        total = total + (part * to[0]) * a
-        total = total + (part * to[1]) * b
-        total = total + (part * to[2]) * c
-        return total + (part * to[3]) * d
+    def segment_of(base: wp.array(dtype=vec3), u: wp.array(dtype=vec3), i: int, j: int, g: int):
+        return segment(edges.wide_edge(base, u, i, j), edges.wide_edge(base, u, i, g))
 
     @func
     def narrow(a: wide3) -> vec3:
@@ -190,8 +208,8 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         i = first + wp.tid()
         v = vertices[i]
-        a = segment(base, u, v[0], v[1], v[3])
-        b = segment(base, u, v[1], v[2], v[4])
+        a = segment_of(base, u, v[0], v[1], v[3])
+        b = segment_of(base, u, v[1], v[2], v[4])
         torque = wide(weight[i]) * axial(a.d * coupling(rotation[i], stiffness[i]) * wp.transpose(b.d))
         ea = along_segment(a, torque)
         wa = across_segment(a, torque)
@@ -218,8 +236,8 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         i = first + wp.tid()
         v = vertices[i]
-        a = segment(base, u, v[0], v[1], v[3])
-        b = segment(base, u, v[1], v[2], v[4])
+        a = segment_of(base, u, v[0], v[1], v[3])
+        b = segment_of(base, u, v[1], v[2], v[4])
         # tr C - tr N as a sum of squares, which loses nothing near rest
         forward = b.d - a.d * rotation[i]
         backward = a.d - b.d * wp.transpose(rotation[i])
@@ -245,13 +263,13 @@ def kernels(real: Real) -> SimpleNamespace:
         """The fifteen blocks of corners a <= b; where `project` says so, positive semidefinite as a whole."""
         i = first + wp.tid()
         v = vertices[i]
-        a = segment(base, u, v[0], v[1], v[3])
-        b = segment(base, u, v[1], v[2], v[4])
+        a = segment_of(base, u, v[0], v[1], v[3])
+        b = segment_of(base, u, v[1], v[2], v[4])
         n = wide(weight[i]) * a.d * coupling(rotation[i], stiffness[i]) * wp.transpose(b.d)
         own = wp.trace(n) * wp.identity(n=3, dtype=wide) - half * (n + wp.transpose(n))
         cross = n - wp.trace(n) * wp.identity(n=3, dtype=wide)  # of omega_b, omega_a
         if project[0] != 0:
-            values, axes = symmetric(own)
+            values, axes = eigen.symmetric(own)
             own = wide33()
             for k in range(3):
                 own += wp.max(values[k], zero) * wp.outer(column(axes, k), column(axes, k))

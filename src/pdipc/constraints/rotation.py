@@ -11,115 +11,106 @@ from sqrt(3) |F|, without a safeguard. The divisor is (s1 + s2) (s2 + s3) (s3 + 
 rotation itself is ill-determined, and an SVD takes over. One Newton-Schulz step makes R orthogonal to rounding.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
 from pdipc.device.language import func
-from pdipc.device.precision import Real
+from pdipc.device.precision import Mat33, unit_roundoff
 
 REFINEMENTS = 2  # of the SVD's rotation
 NEWTON_STEPS = 16  # at most; three or four are usual
-DEGENERATE = {"float32": 2.0e-2, "float64": 1.0e-4}  # of |F|^3: below, an SVD takes over
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    degenerate = wp.constant(scalar(DEGENERATE[real.name]))
-    one, zero = wp.constant(scalar(1.0)), wp.constant(scalar(0.0))
-    settled = wp.constant(scalar(8.0 * real.unit_roundoff))
+@func
+def degenerate(like: wp.float64):
+    """Part of |F|^3 below which the divisor is too small; in the type of `like`."""
+    return wp.float64(1.0e-4)
 
-    @func
-    def cofactor(f: mat33) -> mat33:
-        """cof F = det(F) F^-T: its columns are the cross products of the columns of F."""
-        a = vec3(f[0, 0], f[1, 0], f[2, 0])
-        b = vec3(f[0, 1], f[1, 1], f[2, 1])
-        c = vec3(f[0, 2], f[1, 2], f[2, 2])
-        return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
 
-    @func
-    def orthonormalized(r: mat33) -> mat33:
-        """R (3 I - R^T R) / 2: squares the deviation from orthogonality."""
-        g = wp.transpose(r) * r
-        half = scalar(0.5)
-        return scalar(1.5) * r - half * (r * g)
+@func
+def degenerate(like: wp.float32):  # noqa: F811
+    return wp.float32(2.0e-2)
 
-    @func
-    def rotation_by_svd(f: mat33) -> mat33:
-        """The nearest rotation by a singular value decomposition: robust, and several times slower."""
-        u = mat33()
-        s = vec3()
-        v = mat33()
-        u, s, v = wp.svd3(f)
+
+@func
+def cofactor(f: Mat33):
+    """cof F = det(F) F^-T: its columns are the cross products of the columns of F."""
+    t = wp.transpose(f)
+    return wp.matrix_from_cols(wp.cross(t[1], t[2]), wp.cross(t[2], t[0]), wp.cross(t[0], t[1]))
+
+
+@func
+def orthonormalized(r: Mat33):
+    """R (3 I - R^T R) / 2: squares the deviation from orthogonality."""
+    g = wp.transpose(r) * r
+    return type(r[0][0])(1.5) * r - type(r[0][0])(0.5) * (r * g)
+
+
+@func
+def rotation_by_svd(f: Mat33):
+    """The nearest rotation by a singular value decomposition: robust, and several times slower."""
+    u, s, v = wp.svd3(f)
+    r = u * wp.transpose(v)
+    if wp.determinant(r) < type(s[0])(0.0):
+        # turn the direction of the smallest singular value around
+        small = int(2)
+        if s[0] <= s[1] and s[0] <= s[2]:
+            small = 0
+        elif s[1] <= s[2]:
+            small = 1
+        for i in range(3):
+            u[i, small] = -u[i, small]
         r = u * wp.transpose(v)
-        if wp.determinant(r) < scalar(0.0):
-            # turn the direction of the smallest singular value around
-            small = int(2)
-            if s[0] <= s[1] and s[0] <= s[2]:
-                small = 0
-            elif s[1] <= s[2]:
-                small = 1
-            for i in range(3):
-                u[i, small] = -u[i, small]
-            r = u * wp.transpose(v)
-        return orthonormalized(orthonormalized(r))
+    return orthonormalized(orthonormalized(r))
 
-    @func
-    def refined(f: mat33, rotation: mat33) -> mat33:
-        """Newton's method for R^T F symmetric, from a rotation near that: Warp's SVD in float32 is good to 1e-3 only."""
-        r = rotation
-        for _ in range(REFINEMENTS):
-            s = wp.transpose(r) * f
-            asymmetry = vec3(s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1])
-            h = scalar(-0.5) * (s + wp.transpose(s))
-            trace = wp.trace(s)
-            for i in range(3):
-                h[i, i] += trace
-            turn = cofactor(h) * asymmetry / wp.determinant(h)
-            if wp.length(turn) < scalar(0.3):  # not where the nearest rotation is all but undetermined
-                r = orthonormalized(orthonormalized(r + r * wp.skew(turn)))
-        return r
 
-    @func
-    def nearest_rotation(f: mat33) -> mat33:
-        """argmin over rotations R of |F - R|_F; the identity for F = 0."""
-        size_sq = wp.ddot(f, f)
-        if not (size_sq > scalar(0.0)):
-            largest = wp.max(wp.max(wp.abs(f[0, 0]), wp.abs(f[1, 1])), wp.abs(f[2, 2]))
-            if not (largest > scalar(0.0)):
-                return mat33(
-                    one, zero, zero,
-                    zero, one, zero,
-                    zero, zero, one,
-                )  # fmt: skip
-        g = f / wp.sqrt(size_sq)  # |g| = 1
-        c = cofactor(g)
-        d = g[0, 0] * c[0, 0] + g[1, 0] * c[1, 0] + g[2, 0] * c[2, 0]
-        m = wp.ddot(c, c)
-        i1 = scalar(1.7320508075688772)
-        # p(i1) = (i1^2 - 1)^2 - 4 m - 8 d i1 is convex and increasing from its largest root on
-        settled_at = int(0)
-        for k in range(NEWTON_STEPS):
-            q = i1 * i1 - scalar(1.0)
-            slope = scalar(4.0) * (i1 * q - scalar(2.0) * d)
-            step = (q * q - scalar(4.0) * m - scalar(8.0) * d * i1) / wp.max(slope, scalar(1.0e-30))
-            i1 -= step
-            if wp.abs(step) <= settled:
-                settled_at = k + 1
-                break
-        i2 = scalar(0.5) * (i1 * i1 - scalar(1.0))
-        divisor = i1 * i2 - d
-        if settled_at == 0 or not (divisor > degenerate):
-            return refined(g, rotation_by_svd(g))
-        r = (i1 * c + (i1 * i1 - i2) * g - g * (wp.transpose(g) * g)) / divisor
-        return orthonormalized(r)
+@func
+def refined(f: Mat33, rotation: Mat33):
+    """Newton's method for R^T F symmetric, from a rotation near that: Warp's SVD in float32 is good to 1e-3 only."""
+    r = rotation
+    for _ in range(REFINEMENTS):
+        s = wp.transpose(r) * f
+        asymmetry = type(f[0])(s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1])
+        h = type(f[0][0])(-0.5) * (s + wp.transpose(s))
+        trace = wp.trace(s)
+        for i in range(3):
+            h[i, i] += trace
+        turn = cofactor(h) * asymmetry / wp.determinant(h)
+        if wp.length(turn) < type(f[0][0])(0.3):  # not where the nearest rotation is all but undetermined
+            r = orthonormalized(orthonormalized(r + r * wp.skew(turn)))
+    return r
 
-    return SimpleNamespace(
-        cofactor=cofactor,
-        orthonormalized=orthonormalized,
-        refined=refined,
-        rotation_by_svd=rotation_by_svd,
-        nearest_rotation=nearest_rotation,
-    )
+
+@func
+def nearest_rotation(f: Mat33):
+    """argmin over rotations R of |F - R|_F; the identity for F = 0."""
+    size_sq = wp.ddot(f, f)
+    zero, one, two, four = type(size_sq)(0.0), type(size_sq)(1.0), type(size_sq)(2.0), type(size_sq)(4.0)
+    if not (size_sq > zero):
+        largest = wp.max(wp.max(wp.abs(f[0, 0]), wp.abs(f[1, 1])), wp.abs(f[2, 2]))
+        if not (largest > zero):
+            return type(f)(
+                one, zero, zero,
+                zero, one, zero,
+                zero, zero, one,
+            )  # fmt: skip
+    g = f / wp.sqrt(size_sq)  # |g| = 1
+    c = cofactor(g)
+    d = g[0, 0] * c[0, 0] + g[1, 0] * c[1, 0] + g[2, 0] * c[2, 0]
+    m = wp.ddot(c, c)
+    i1 = type(size_sq)(1.7320508075688772)
+    # p(i1) = (i1^2 - 1)^2 - 4 m - 8 d i1 is convex and increasing from its largest root on
+    settled_at = int(0)
+    for k in range(NEWTON_STEPS):
+        q = i1 * i1 - one
+        slope = four * (i1 * q - two * d)
+        step = (q * q - four * m - type(size_sq)(8.0) * d * i1) / wp.max(slope, type(size_sq)(1.0e-30))
+        i1 -= step
+        if wp.abs(step) <= type(size_sq)(8.0) * unit_roundoff(size_sq):
+            settled_at = k + 1
+            break
+    i2 = type(size_sq)(0.5) * (i1 * i1 - one)
+    divisor = i1 * i2 - d
+    if settled_at == 0 or not (divisor > degenerate(size_sq)):
+        return refined(g, rotation_by_svd(g))
+    r = (i1 * c + (i1 * i1 - i2) * g - g * (wp.transpose(g) * g)) / divisor
+    return orthonormalized(r)

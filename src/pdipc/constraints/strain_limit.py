@@ -21,8 +21,7 @@ from pdipc.constraints import triangles
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.device.precision import Real, Scalar
 
 NAME = "strain_limit"
 CORNERS = triangles.CORNERS
@@ -45,38 +44,31 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
     return [*triangles.arguments(device, real, s), limit]
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """barrier(s, limit): W, W' and W'' of one singular value, over w."""
-    scalar, vec3 = real.scalar, real.vec3
-    begin, width = wp.constant(scalar(BEGIN)), wp.constant(scalar(END - BEGIN))
-    firm, zero, one, two = (wp.constant(scalar(value)) for value in (FIRM, 0.0, 1.0, 2.0))
-
-    @func
-    def barrier(s: scalar, limit: scalar) -> vec3:
-        t = ((s - one) / limit - begin) / width  # from 0 to 1
-        if t <= zero:
-            return vec3()
-        a = wp.min(t, one - firm)
-        log = wp.log(one - a)
-        rest = one - a
-        value = -a * a * log
-        slope = a * (a / rest - two * log)
-        bend = -two * log + two * two * a / rest + a * a / (rest * rest)
-        more = t - a
-        value += more * (slope + more * bend / two)
-        slope += more * bend
-        return vec3(width * width * limit * limit * value, width * limit * slope, bend)
-
-    return SimpleNamespace(barrier=barrier)
+@func
+def barrier(s: Scalar, limit: Scalar):
+    """W, W' and W'' of one singular value, over w."""
+    zero, one, two = type(s)(0.0), type(s)(1.0), type(s)(2.0)
+    width = type(s)(wp.static(END - BEGIN))
+    t = ((s - one) / limit - type(s)(BEGIN)) / width  # from 0 to 1
+    if t <= zero:
+        return wp.vector(zero, zero, zero)
+    a = wp.min(t, one - type(s)(FIRM))
+    log = wp.log(one - a)
+    rest = one - a
+    value = -a * a * log
+    slope = a * (a / rest - two * log)
+    bend = -two * log + two * two * a / rest + a * a / (rest * rest)
+    more = t - a
+    value += more * (slope + more * bend / two)
+    slope += more * bend
+    return wp.vector(width * width * limit * limit * value, width * limit * slope, bend)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
     module = real.module(__name__)
-    f_of, own, wide_own = triangles.functions(real), triangles.hessians(real), triangles.hessians(real_of("float64"))
-    barrier, wide_barrier = functions(real).barrier, functions(real_of("float64")).barrier
+    f_of, write = triangles.functions(real), triangles.writer(real)
     wide, tiny, close = wp.float64, wp.constant(scalar(1.0e-3)), wp.constant(scalar(CLOSE[real.name]))
 
     @kernel(module, "force")
@@ -95,9 +87,9 @@ def kernels(real: Real) -> SimpleNamespace:
         e = first + wp.tid()
         b = inverse[e]
         f = f_of.wide_deformation(base, u, vertices[e], b)
-        angle, s1, s2, u1, u2, _n = wide_own.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
-        t1 = wide(weight[e]) * wide_barrier(s1, wide(limit[e]))[1] * u1
-        t2 = wide(weight[e]) * wide_barrier(s2, wide(limit[e]))[1] * u2
+        angle, s1, s2, u1, u2, _n = triangles.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
+        t1 = wide(weight[e]) * barrier(s1, wide(limit[e]))[1] * u1
+        t2 = wide(weight[e]) * barrier(s2, wide(limit[e]))[1] * u2
         c = wp.cos(angle)
         s = wp.sin(angle)
         d1 = -(c * t1 - s * t2)
@@ -125,8 +117,8 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         e = first + wp.tid()
         f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
-        _angle, s1, s2, _u1, _u2, _n = wide_own.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
-        total = wide_barrier(s1, wide(limit[e]))[0] + wide_barrier(s2, wide(limit[e]))[0]
+        _angle, s1, s2, _u1, _u2, _n = triangles.axes(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2]))
+        total = barrier(s1, wide(limit[e]))[0] + barrier(s2, wide(limit[e]))[0]
         energy_out[offset + e] = wide(weight[e]) * total
 
     @kernel(module, "hessian")
@@ -145,7 +137,7 @@ def kernels(real: Real) -> SimpleNamespace:
         """The six blocks of corners a <= b. W is convex: there is nothing to project."""
         e = first + wp.tid()
         f = f_of.deformation(base, u, vertices[e], inverse[e])
-        angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
+        angle, s1, s2, u1, u2, n = triangles.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
         w1 = barrier(s1, limit[e])
         w2 = barrier(s2, limit[e])
         # (W1 - W2) / (s1 - s2), from the middle where they are close
@@ -155,6 +147,6 @@ def kernels(real: Real) -> SimpleNamespace:
         pair = vec2((w1[1] + w2[1]) / wp.max(s1 + s2, tiny), flip)
         tilt = vec2(w1[1] / wp.max(s1, tiny), w2[1] / wp.max(s2, tiny))
         stretch = vec3(w1[2], scalar(0.0), w2[2])
-        own.write(stretch, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
+        write(stretch, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)

@@ -9,7 +9,7 @@ import warp as wp
 from pdipc.constraints import rotation, tets
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar, Vec3
 
 NAME = "tet_strain"
 CORNERS = tets.CORNERS
@@ -22,32 +22,24 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, weight_per_volume) ->
     return tets.make(NAME, rest_positions, vertices, weight_per_volume)
 
 
-def project_of(real: Real):
-    """project(F): the nearest rotation."""
-    return rotation.functions(real).nearest_rotation
-
-
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """project(F); principal(s, mu, lame): W = sum (s_i - 1)^2 / 2."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    one = wp.constant(scalar(1.0))
-    two = wp.constant(scalar(2.0))
-    least = wp.constant(scalar(1.0e-6))
-
-    @func
-    def principal(s: vec3, mu: scalar, lame: scalar):
-        twist = vec3(
-            one - two / wp.max(s[1] + s[2], least),
-            one - two / wp.max(s[0] + s[2], least),
-            one - two / wp.max(s[0] + s[1], least),
-        )
-        identity = wp.identity(n=3, dtype=scalar)
-        return mat33(identity), twist, vec3(one, one, one)
-
-    return SimpleNamespace(project=project_of(real), principal=principal)
+@func
+def principal(s: Vec3, mu: Scalar, lame: Scalar):
+    """W = sum (s_i - 1)^2 / 2."""
+    zero, one, two, least = type(s[0])(0.0), type(s[0])(1.0), type(s[0])(2.0), type(s[0])(1.0e-6)
+    twist = type(s)(
+        one - two / wp.max(s[1] + s[2], least),
+        one - two / wp.max(s[0] + s[2], least),
+        one - two / wp.max(s[0] + s[1], least),
+    )
+    like = wp.outer(s, s)
+    identity = type(like)(
+        one, zero, zero,
+        zero, one, zero,
+        zero, zero, one,
+    )  # fmt: skip
+    return identity, twist, type(s)(one, one, one)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return tets.projective(real, real.module(__name__), project_of, functions(real).principal)
+    return tets.projective(real, real.module(__name__), rotation.nearest_rotation, principal)

@@ -28,7 +28,6 @@ from pdipc.constraints.base import ConstraintSet, make_set
 from pdipc.device.language import func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
 
 CORNERS = 4
 
@@ -67,7 +66,6 @@ def functions(real: Real) -> SimpleNamespace:
     """Deformation gradients, and blocks of the Hessian."""
     scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
     wide, wide3, wide33 = wp.float64, wp.vec3d, wp.mat33d
-    eig, rot = eigen.functions(real), rotation.functions(real)
     zero = wp.constant(scalar(0.0))
 
     @func
@@ -109,8 +107,8 @@ def functions(real: Real) -> SimpleNamespace:
     @func
     def singular_values(f: mat33):
         """Signed s, U and V with F = U diag(s) V^T, both rotations: from the polar decomposition."""
-        r = rot.nearest_rotation(f)
-        s, v = eig.symmetric(wp.transpose(r) * f)
+        r = rotation.nearest_rotation(f)
+        s, v = eigen.symmetric(wp.transpose(r) * f)
         return s, r * v, v
 
     @func
@@ -139,7 +137,6 @@ def functions(real: Real) -> SimpleNamespace:
         return i[0] * wp.dot(a, b) * wp.identity(n=3, dtype=scalar) + outer - i[3] * skew(f * wp.cross(a, b))
 
     return SimpleNamespace(
-        cofactor=rot.cofactor,
         plain_block=plain_block,
         edge=edge,
         wide_edge=wide_edge,
@@ -157,7 +154,7 @@ def kernels(
 ) -> SimpleNamespace:
     """Force, energy and Hessian of tets. stress, and density(F, mu, lame), the energy over the weight: in double precision."""
     scalar, vec2, vec3, mat33 = real.scalar, real.vec2, real.vec3, real.mat33
-    f_of, eig = functions(real), eigen.functions(real)
+    f_of = functions(real)
     half, zero, wide = wp.constant(scalar(0.5)), wp.constant(scalar(0.0)), wp.float64
     plain = invariants
 
@@ -225,7 +222,7 @@ def kernels(
         if wp.static(invariants is not None):  # noqa: SIM102  (Warp compiles neither otherwise)
             if project[0] == 0:
                 i = w * plain(f, modulus[e][0], modulus[e][1])
-                c = f_of.cofactor(f)
+                c = rotation.cofactor(f)
                 b1 = vec3(b[0, 0], b[0, 1], b[0, 2])
                 b2 = vec3(b[1, 0], b[1, 1], b[1, 2])
                 b3 = vec3(b[2, 0], b[2, 1], b[2, 2])
@@ -240,7 +237,7 @@ def kernels(
         s, turn, axes = f_of.singular_values(f)
         stretch, twist, flip = principal(s, modulus[e][0], modulus[e][1])
         if project[0] != 0:
-            stretch = eig.positive_part(stretch)
+            stretch = eigen.positive_part(stretch)
             for k in range(3):
                 twist[k] = wp.max(twist[k], zero)
                 flip[k] = wp.max(flip[k], zero)
@@ -266,9 +263,8 @@ def kernels(
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
 
 
-def projective(real: Real, module: wp.Module, project_of: Callable[[Real], Callable], principal: Callable) -> SimpleNamespace:
-    """Kernels of a kind whose energy is |F - P|^2 / 2, P the projection of F: project_of(real) makes project(F) -> P."""
-    project = project_of(real_of("float64"))
+def projective(real: Real, module: wp.Module, project: Callable, principal: Callable) -> SimpleNamespace:
+    """Kernels of a kind whose energy is |F - P|^2 / 2, P the projection of F."""
 
     @func
     def stress(f: wp.mat33d, mu: wp.float64, lame: wp.float64) -> wp.mat33d:

@@ -13,7 +13,7 @@ import warp as wp
 from pdipc.constraints import triangles
 from pdipc.constraints.base import ConstraintSet
 from pdipc.device.language import func
-from pdipc.device.precision import Real
+from pdipc.device.precision import Real, Scalar, Vec3
 
 NAME = "triangle_strain"
 CORNERS = triangles.CORNERS
@@ -26,42 +26,32 @@ def rest(rest_positions: np.ndarray, vertices: np.ndarray, weight_per_area) -> C
     return triangles.make(NAME, rest_positions, vertices, weight_per_area)
 
 
-@functools.cache
-def functions(real: Real) -> SimpleNamespace:
-    """project(f1, f2): the columns of the nearest isometry as rows. principal(s1, s2): W = ((s1 - 1)^2 + (s2 - 1)^2) / 2."""
-    scalar, vec2, vec3 = real.scalar, real.vec2, real.vec3
-    one, least = wp.constant(scalar(1.0)), wp.constant(scalar(1.0e-6))
-    mat23 = wp.types.matrix((2, 3), scalar)
-    normal = triangles.normal_function(real)
-
-    @func
-    def project(f1: vec3, f2: vec3) -> mat23:
-        n = normal(f1, f2)
-        p1 = f1 + wp.cross(f2, n)
-        p2 = f2 + wp.cross(n, f1)
-        size = wp.sqrt(scalar(0.5) * (wp.length_sq(p1) + wp.length_sq(p2)))
-        if size > scalar(0.0):
-            p1 = p1 / size
-            p2 = p2 / size
-        else:
-            p1 = vec3(scalar(1.0), scalar(0.0), scalar(0.0))
-            p2 = vec3(scalar(0.0), scalar(1.0), scalar(0.0))
-        return mat23(p1[0], p1[1], p1[2], p2[0], p2[1], p2[2])
-
-    @func
-    def principal(s1: scalar, s2: scalar):
-        twist = one - scalar(2.0) / wp.max(s1 + s2, least)
-        tilt = vec2(one - one / wp.max(s1, least), one - one / wp.max(s2, least))
-        return vec3(one, scalar(0.0), one), vec2(twist, one), tilt
-
-    return SimpleNamespace(project=project, principal=principal)
+@func
+def project(f1: Vec3, f2: Vec3):
+    """The columns of the nearest isometry as rows."""
+    zero, one = type(f1[0])(0.0), type(f1[0])(1.0)
+    n = triangles.normal(f1, f2)
+    p1 = f1 + wp.cross(f2, n)
+    p2 = f2 + wp.cross(n, f1)
+    size = wp.sqrt(type(f1[0])(0.5) * (wp.length_sq(p1) + wp.length_sq(p2)))
+    if size > zero:
+        p1 = p1 / size
+        p2 = p2 / size
+    else:
+        p1 = type(f1)(one, zero, zero)
+        p2 = type(f1)(zero, one, zero)
+    return wp.matrix_from_rows(p1, p2)
 
 
-def project_of(real: Real):
-    """project(f1, f2): the nearest isometry."""
-    return functions(real).project
+@func
+def principal(s1: Scalar, s2: Scalar):
+    """Of W = ((s1 - 1)^2 + (s2 - 1)^2) / 2."""
+    zero, one, least = type(s1)(0.0), type(s1)(1.0), type(s1)(1.0e-6)
+    twist = one - type(s1)(2.0) / wp.max(s1 + s2, least)
+    tilt = wp.vector(one - one / wp.max(s1, least), one - one / wp.max(s2, least))
+    return wp.vector(one, zero, one), wp.vector(twist, one), tilt
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    return triangles.kernels(real, real.module(__name__), project_of, functions(real).principal)
+    return triangles.kernels(real, real.module(__name__), project, principal)

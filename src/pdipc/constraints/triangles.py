@@ -9,10 +9,9 @@ import warp as wp
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
-from pdipc.device.language import func, kernel
+from pdipc.device.language import Function, func, kernel
 from pdipc.device.launch import Device
-from pdipc.device.precision import Real
-from pdipc.device.precision import real as real_of
+from pdipc.device.precision import Real, Scalar, Vec2, Vec3
 
 CORNERS = 3
 
@@ -71,6 +70,80 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
     return [wp.array(s.data["inverse"], dtype=real.mat22, device=device.warp)]
 
 
+@func
+def normal(f1: Vec3, f2: Vec3):
+    """The unit normal of a deformed triangle; where it has no area, a fixed choice across its longer side."""
+    zero, one = type(f1[0])(0.0), type(f1[0])(1.0)
+    c = wp.cross(f1, f2)
+    size = wp.length(c)
+    if size > type(f1[0])(1.0e-12) * (wp.length_sq(f1) + wp.length_sq(f2)):
+        return c / size
+    u = f1
+    if wp.length_sq(f2) > wp.length_sq(f1):
+        u = f2
+    axis = type(f1)(zero, one, zero)
+    if wp.abs(u[1]) > type(f1[0])(0.9) * wp.length(u):
+        axis = type(f1)(one, zero, zero)
+    c = wp.cross(axis, u)
+    if wp.length_sq(c) > zero:
+        return wp.normalize(c)
+    return type(f1)(zero, zero, one)
+
+
+@func
+def axes(f1: Vec3, f2: Vec3):
+    """An angle, singular values and vectors of F, and the normal.
+
+    F^T F = V diag(s^2) V^T, V the rotation by `angle`; s1 and s2 follow from their sum and difference of squares without cancellation.
+    """
+    n = normal(f1, f2)
+    c11 = wp.dot(f1, f1)
+    c12 = wp.dot(f1, f2)
+    c22 = wp.dot(f2, f2)
+    angle = type(c12)(0.5) * wp.atan2(type(c12)(2.0) * c12, c11 - c22)
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    h1 = c * f1 + s * f2
+    h2 = c * f2 - s * f1
+    s1 = wp.length(h1)
+    s2 = wp.length(h2)
+    u1 = wp.normalize(h1)
+    u2 = wp.cross(n, u1)
+    if s1 < s2:
+        u2 = wp.normalize(h2)
+        u1 = wp.cross(u2, n)
+    return angle, s1, s2, u1, u2, n
+
+
+@func
+def block(k: Vec3, p: Scalar, q: Scalar, tilt: Vec2, u1: Vec3, u2: Vec3, n: Vec3, a: Vec2, b: Vec2):
+    """The Hessian between two corners of gradients a and b in the axes of the singular values."""
+    h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
+    h12 = k[1] * a[0] * b[1] + q * a[1] * b[0]
+    h21 = k[1] * a[1] * b[0] + q * a[0] * b[1]
+    h22 = k[2] * a[1] * b[1] + p * a[0] * b[0]
+    hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
+    return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
+
+
+@func
+def positive_stretch(k: Vec3):
+    """What is positive of the symmetric 2x2 matrix of entries 11, 12 and 22."""
+    zero, one, half = type(k[0])(0.0), type(k[0])(1.0), type(k[0])(0.5)
+    mean = half * (k[0] + k[2])
+    spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
+    if not (mean - spread < zero):
+        return k
+    high = wp.max(mean + spread, zero)
+    # high times the projector on its eigenvector
+    cosine = zero
+    sine = zero
+    if spread > zero:
+        cosine = half * (k[0] - k[2]) / spread
+        sine = k[1] / spread
+    return half * high * type(k)(one + cosine, sine, one - cosine)
+
+
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """Deformation gradients of triangles, their columns f1 and f2, in the scene's precision and in double."""
@@ -101,42 +174,10 @@ def functions(real: Real) -> SimpleNamespace:
 
 
 @functools.cache
-def hessians(real: Real) -> SimpleNamespace:
-    """axes(f1, f2): an angle, singular values and vectors of F, and the normal; write(...): the blocks of an isotropic energy of them."""
+def writer(real: Real) -> Function:
+    """write(...): the blocks of an isotropic energy of the singular values."""
     scalar, vec2, vec3, mat22, mat33 = real.scalar, real.vec2, real.vec3, real.mat22, real.mat33
-    normal = normal_function(real)
-    zero, one, half = wp.constant(scalar(0.0)), wp.constant(scalar(1.0)), wp.constant(scalar(0.5))
-
-    @func
-    def block(k: vec3, p: scalar, q: scalar, tilt: vec2, u1: vec3, u2: vec3, n: vec3, a: vec2, b: vec2) -> mat33:
-        """The Hessian between two corners of gradients a and b in the axes of the singular values."""
-        h11 = k[0] * a[0] * b[0] + p * a[1] * b[1]
-        h12 = k[1] * a[0] * b[1] + q * a[1] * b[0]
-        h21 = k[1] * a[1] * b[0] + q * a[0] * b[1]
-        h22 = k[2] * a[1] * b[1] + p * a[0] * b[0]
-        hn = tilt[0] * a[0] * b[0] + tilt[1] * a[1] * b[1]
-        return wp.outer(u1, h11 * u1 + h12 * u2) + wp.outer(u2, h21 * u1 + h22 * u2) + wp.outer(n, hn * n)
-
-    @func
-    def axes(f1: vec3, f2: vec3):
-        """F^T F = V diag(s^2) V^T, V the rotation by `angle`; s1 and s2 follow from their sum and difference of squares without cancellation."""
-        n = normal(f1, f2)
-        c11 = wp.dot(f1, f1)
-        c12 = wp.dot(f1, f2)
-        c22 = wp.dot(f2, f2)
-        angle = half * wp.atan2(scalar(2.0) * c12, c11 - c22)
-        c = wp.cos(angle)
-        s = wp.sin(angle)
-        h1 = c * f1 + s * f2
-        h2 = c * f2 - s * f1
-        s1 = wp.length(h1)
-        s2 = wp.length(h2)
-        u1 = wp.normalize(h1)
-        u2 = wp.cross(n, u1)
-        if s1 < s2:
-            u2 = wp.normalize(h2)
-            u1 = wp.cross(u2, n)
-        return angle, s1, s2, u1, u2, n
+    zero, half = wp.constant(scalar(0.0)), wp.constant(scalar(0.5))
 
     # Arguments: an element in its own axes, and where its blocks go.
     @func
@@ -160,18 +201,8 @@ def hessians(real: Real) -> SimpleNamespace:
         c = wp.cos(angle)
         s = wp.sin(angle)
         # the positive part of the stretch, twist, flip and tilt
-        mean = half * (k[0] + k[2])
-        spread = wp.sqrt(half * half * (k[0] - k[2]) * (k[0] - k[2]) + k[1] * k[1])
-        low = mean - spread
-        if low < zero and project != 0:
-            high = wp.max(mean + spread, zero)
-            # high times the projector on its eigenvector
-            cosine = zero
-            sine = zero
-            if spread > zero:
-                cosine = half * (k[0] - k[2]) / spread
-                sine = k[1] / spread
-            k = half * high * vec3(one + cosine, sine, one - cosine)
+        if project != 0:
+            k = positive_stretch(k)
         k = w * k
         t = pair[0]
         flip = pair[1]
@@ -189,18 +220,17 @@ def hessians(real: Real) -> SimpleNamespace:
         blocks_out[at + 2] = block(k, p, q, out, u1, u2, n, g0, g2)
         blocks_out[at + 4] = block(k, p, q, out, u1, u2, n, g1, g2)
 
-    return SimpleNamespace(axes=axes, write=write)
+    return write
 
 
-def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable], principal: Callable) -> SimpleNamespace:
+def kernels(real: Real, module: wp.Module, project_of: Callable, principal: Callable) -> SimpleNamespace:
     """Force, energy and Hessian of triangles of the energy |F - P|^2 / 2.
 
-    project_of(real): makes project(f1, f2), the two columns of P as rows of a 2x3 matrix. principal(s1, s2): see `tets`; the stretch
+    project_of(f1, f2): the two columns of P as rows of a 2x3 matrix. principal(s1, s2): see `tets`; the stretch
     W_11, W_12, W_22, then what it costs to twist, to flip, and per axis to tilt out of the plane, W_i / s_i.
     """
     scalar, vec3, mat22, mat33 = real.scalar, real.vec3, real.mat22, real.mat33
-    project = project_of(real_of("float64"))
-    f_of, own = functions(real), hessians(real)
+    f_of, write = functions(real), writer(real)
 
     @kernel(module, "force")
     def force(
@@ -217,7 +247,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         e = first + wp.tid()
         b = inverse[e]
         f = f_of.wide_deformation(base, u, vertices[e], b)
-        d = project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
+        d = project_of(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         d1 = weight[e] * vec3(scalar(d[0, 0]), scalar(d[0, 1]), scalar(d[0, 2]))
         d2 = weight[e] * vec3(scalar(d[1, 0]), scalar(d[1, 1]), scalar(d[1, 2]))
         g1 = b[0, 0] * d1 + b[0, 1] * d2
@@ -240,7 +270,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
     ):
         e = first + wp.tid()
         f = f_of.wide_deformation(base, u, vertices[e], inverse[e])
-        d = project(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
+        d = project_of(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         energy_out[offset + e] = wp.float64(0.5) * wp.float64(weight[e]) * wp.ddot(d, d)
 
     @kernel(module, "hessian")
@@ -258,32 +288,8 @@ def kernels(real: Real, module: wp.Module, project_of: Callable[[Real], Callable
         """The blocks of corners a < b; where `project` says so, positive semidefinite as a whole."""
         e = first + wp.tid()
         f = f_of.deformation(base, u, vertices[e], inverse[e])
-        angle, s1, s2, u1, u2, n = own.axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
+        angle, s1, s2, u1, u2, n = axes(vec3(f[0, 0], f[0, 1], f[0, 2]), vec3(f[1, 0], f[1, 1], f[1, 2]))
         k, pair, tilt = principal(s1, s2)
-        own.write(k, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
+        write(k, pair, tilt, weight[e], angle, u1, u2, n, inverse[e], project[0], offset + 6 * e, blocks_out)
 
     return SimpleNamespace(force=force, energy=energy, hessian=hessian)
-
-
-def normal_function(real: Real):
-    """normal(f1, f2): the unit normal of a deformed triangle; where it has no area, a fixed choice across its longer side."""
-    scalar, vec3 = real.scalar, real.vec3
-
-    @func
-    def normal(f1: vec3, f2: vec3) -> vec3:
-        c = wp.cross(f1, f2)
-        size = wp.length(c)
-        if size > scalar(1.0e-12) * (wp.length_sq(f1) + wp.length_sq(f2)):
-            return c / size
-        u = f1
-        if wp.length_sq(f2) > wp.length_sq(f1):
-            u = f2
-        axis = vec3(scalar(0.0), scalar(1.0), scalar(0.0))
-        if wp.abs(u[1]) > scalar(0.9) * wp.length(u):
-            axis = vec3(scalar(1.0), scalar(0.0), scalar(0.0))
-        c = wp.cross(axis, u)
-        if wp.length_sq(c) > scalar(0.0):
-            return wp.normalize(c)
-        return vec3(scalar(0.0), scalar(0.0), scalar(1.0))
-
-    return normal

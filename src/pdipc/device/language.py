@@ -47,3 +47,11 @@ else:
 def struct_of(name: str, module: str, **fields: Any) -> Any:
     """A struct whose arrays are of a precision: their types are values, which a class could not say. module: `__name__` where it is made."""
     return wp.struct(type(name, (), {"__module__": module, "__annotations__": fields}))
+
+
+def filled(struct: Any, source: object) -> Any:
+    """A struct's fields from the attributes of `source` that have their names. Arrays that are replaced need a new one."""
+    made = struct()
+    for name in struct.vars:
+        setattr(made, name, getattr(source, name))
+    return made

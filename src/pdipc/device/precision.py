@@ -22,6 +22,7 @@ wp.config.log_level = wp.LOG_WARNING  # no banner; every module that uses Warp i
 # What a function of both precisions takes.
 Scalar = wp.Float
 Vec3, Vec4, Mat33 = wp.types.vector(3, wp.Float), wp.types.vector(4, wp.Float), wp.types.matrix((3, 3), wp.Float)
+Vec2, Mat43 = wp.types.vector(2, wp.Float), wp.types.matrix((4, 3), wp.Float)
 
 
 @func

@@ -26,13 +26,14 @@ import functools
 import itertools
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from pdipc.device.language import kernel
+from pdipc.device.language import filled, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -48,8 +49,31 @@ AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see 
 
 
 @functools.cache
+def ways(real: Real) -> Any:
+    """A struct: the waypoints of all movers in a step. Those of mover m are `offset[m]` to `offset[m] + count[m] - 1`."""
+    return struct_of(
+        "Ways",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        offset=wp.array(dtype=wp.int32),
+        straight=wp.array(dtype=wp.int32),  # whether it goes straight from one to the next, and does not turn
+        center=wp.array(dtype=wp.vec3d),  # what it turns about, at the start, m
+        turns=wp.array(dtype=wp.mat33d),  # of each waypoint: the turn from the start,
+        places=wp.array(dtype=wp.vec3d),  # where the center is, m,
+        parts=wp.array(
+            dtype=wp.float64
+        ),  # or how far along a way that bends: the piece's number and, after the point, how much of it
+        bends=wp.array(dtype=wp.int32),  # of each mover: corners of its way
+        bend_offset=wp.array(dtype=wp.int32),
+        size=wp.array(dtype=wp.int32),  # members
+        corners=wp.array(dtype=real.vec3),  # where each member is at each corner, m
+        goal=wp.array(dtype=real.vec3),  # of each vertex, m, where the way ends
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Ways = real.scalar, real.vec3, ways(real)
     module = real.module(__name__)
     zero = wp.constant(scalar(0.0))
 
@@ -76,41 +100,28 @@ def kernels(real: Real) -> SimpleNamespace:
         mover: wp.array(dtype=wp.int32),
         points: wp.array(dtype=wp.vec3d),
         at: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-        offset: wp.array(dtype=wp.int32),
-        straight: wp.array(dtype=wp.int32),
-        center: wp.array(dtype=wp.vec3d),
-        turns: wp.array(dtype=wp.mat33d),
-        places: wp.array(dtype=wp.vec3d),
-        parts: wp.array(dtype=wp.float64),
-        bends: wp.array(dtype=wp.int32),
-        bend_offset: wp.array(dtype=wp.int32),
-        size: wp.array(dtype=wp.int32),
-        corners: wp.array(dtype=vec3),
+        ways: Ways,
         x_start: wp.array(dtype=vec3),
-        goal: wp.array(dtype=vec3),
         target_out: wp.array(dtype=vec3),
     ):
-        """The waypoint that each member goes to now: on an arc, or on the pieces from corner to corner of a way that bends, of which
-        parts has the number and, after the point, how much of it.
-        """
+        """The waypoint that each member goes to now: on an arc, or on the pieces from corner to corner of a way that bends."""
         k = first + wp.tid()
         i = members[k]
         m = mover[i]
-        slot = offset[m] + at[m] - 1
-        target_out[i] = goal[i]
-        if at[m] < count[m]:
-            if straight[m] != 0:
-                piece = int(wp.floor(parts[slot]))
+        slot = ways.offset[m] + at[m] - 1
+        target_out[i] = ways.goal[i]
+        if at[m] < ways.count[m]:
+            if ways.straight[m] != 0:
+                piece = int(wp.floor(ways.parts[slot]))
                 a = x_start[i]
-                b = goal[i]
+                b = ways.goal[i]
                 if piece > 0:
-                    a = corners[bend_offset[m] + (piece - 1) * size[m] + k]
-                if piece < bends[m]:
-                    b = corners[bend_offset[m] + piece * size[m] + k]
-                target_out[i] = a + scalar(parts[slot] - wp.float64(piece)) * (b - a)
+                    a = ways.corners[ways.bend_offset[m] + (piece - 1) * ways.size[m] + k]
+                if piece < ways.bends[m]:
+                    b = ways.corners[ways.bend_offset[m] + piece * ways.size[m] + k]
+                target_out[i] = a + scalar(ways.parts[slot] - wp.float64(piece)) * (b - a)
             else:
-                x = turns[slot] * (points[k] - center[m]) + places[slot]
+                x = ways.turns[slot] * (points[k] - ways.center[m]) + ways.places[slot]
                 target_out[i] = vec3(scalar(x[0]), scalar(x[1]), scalar(x[2]))
 
     @kernel(module)
@@ -522,9 +533,7 @@ class Script:
         self.device.launch(self.kernels.hold, len(self.movers), [self.crowded, self.drive])
 
     def _aim(self, x_start: wp.array) -> None:
-        table = [self.count, self.offset, self.straight, self.center, self.turns, self.places, self.parts]
-        corners = [self.bends, self.bend_offset, self.size, self.corners]
-        inputs = [self.members, self.mover, self.points, self.at, *table, *corners, x_start, self.goal, self.target]
+        inputs = [self.members, self.mover, self.points, self.at, filled(ways(self.real), self), x_start, self.target]
         self.device.launch(self.kernels.aim, self.member_count, inputs)
 
     def advance(self, x_start: wp.array, u: wp.array, fraction: wp.array, progress: wp.array) -> None:

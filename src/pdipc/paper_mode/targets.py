@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from pdipc.barrier import potential as barrier
-from pdipc.barrier.pairs import FrozenPairs
+from pdipc.barrier.pairs import FrozenPairs, frozen
 from pdipc.collision.candidates import Candidates
 from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Span
@@ -33,7 +33,7 @@ OUTER_SQUARED = 1.0e-4  # eps_outer, m^2: the outer loop ends when the squared n
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    scalar, vec3, Frozen = real.scalar, real.vec3, frozen(real)
     module = real.module(__name__)
 
     @kernel(module)
@@ -51,13 +51,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def project(
         span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        stiffness: wp.array(dtype=scalar),
+        pairs: Frozen,
         mass: wp.array(dtype=scalar),
         free: wp.array(dtype=scalar),
         motion: wp.array(dtype=vec3),
@@ -68,15 +62,15 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Of each pair: its weight, N/m, and the impulse times h that reflects its approach, kg m."""
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
-                q = quads[k]
-                a = weights[k]
+        for b in range(worker * span.block, pairs.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, pairs.count[0])):
+                q = pairs.quads[k]
+                a = pairs.weights[k]
                 approach = scalar(0.0)
                 response = scalar(0.0)
                 lightest = scalar(wp.inf)
                 for s in range(4):
-                    approach += a[s] * wp.dot(normals[k], motion[q[s]])
+                    approach += a[s] * wp.dot(pairs.normals[k], motion[q[s]])
                     if free[q[s]] > scalar(0.0):
                         response += a[s] * a[s] / mass[q[s]]
                         lightest = wp.min(lightest, mass[q[s]])
@@ -84,18 +78,17 @@ def kernels(real: Real) -> SimpleNamespace:
                 if approach < scalar(0.0) and response > scalar(0.0):
                     impulse = -(scalar(1.0) + restitution) * approach / response
                 impulse_out[k] = impulse
-                steep = barrier.barrier(gaps[k], activation[k]) / (activation[k] * activation[k])
+                steep = barrier.barrier(pairs.gaps[k], pairs.activation[k]) / (pairs.activation[k] * pairs.activation[k])
                 pull_out[k] = scalar(0.0)
                 if response > scalar(0.0):
-                    pull_out[k] = stiffness[k] * steep + lightest / (h * h)
+                    pull_out[k] = pairs.stiffness[k] * steep + lightest / (h * h)
 
     @kernel(module)
     def gather(
         first: int,
         ends: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
+        pairs: Frozen,
         pull: wp.array(dtype=scalar),
         impulse: wp.array(dtype=scalar),
         mass: wp.array(dtype=scalar),
@@ -116,9 +109,9 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[v] > scalar(0.0):
             for i in range(low, ends[v]):
                 k = entries[i] // 4
-                a = weights[k][entries[i] % 4]
+                a = pairs.weights[k][entries[i] % 4]
                 w = pull[k] * wp.abs(a)
-                y = motion[v] + (a * impulse[k] / mass[v]) * normals[k]
+                y = motion[v] + (a * impulse[k] / mass[v]) * pairs.normals[k]
                 total += w
                 drag += w * y
                 offset += scalar(0.5) * w * wp.length_sq(y)
@@ -196,10 +189,9 @@ class PaperPairs(FrozenPairs):
     ) -> None:
         super().freeze(candidates, x, ahead, driven)
         k = self.own
-        pairs = [self.weights, self.normals]
-        rest = [self.gaps, self.activation, self.stiffness, self.mass, self.free, self.motion, self.restitution, self.h]
-        self.device.launch_list(k.project, self.capacity, [self.count, self.quads, *pairs, *rest, self.pull, self.impulse])
-        inputs = [self.ends, self.entries, *pairs, self.pull, self.impulse, self.mass, self.free, self.motion]
+        inputs = [self.frozen, self.mass, self.free, self.motion, self.restitution, self.h, self.pull, self.impulse]
+        self.device.launch_list(k.project, self.capacity, inputs)
+        inputs = [self.ends, self.entries, self.frozen, self.pull, self.impulse, self.mass, self.free, self.motion]
         self.device.launch(k.gather, len(x), [*inputs, self.scalar, self.drag, self.offset])
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 LISTED = 5  # refused combinations that a message names
+SUCCESSOR_SECONDS = (
+    3600.0  # that a dead worker's successor may take to start: Dask's 15 s pass on a busy machine, and then nobody is left
+)
 CONNECT_SECONDS = 10.0  # after which a scheduler counts as not there
 
 
@@ -37,6 +40,7 @@ def cores() -> int:
 @contextmanager
 def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
     """A client of the cluster at an address, or of one of processes on this machine, which end with it."""
+    import dask
     from distributed import Client, LocalCluster
 
     if scheduler is not None:
@@ -51,6 +55,7 @@ def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
     level = log.level
     try:
         with (
+            dask.config.set({"distributed.deploy.lost-worker-timeout": SUCCESSOR_SECONDS}),
             # without a limit of memory: Dask would end a worker for using more than an even share
             LocalCluster(
                 n_workers=workers,

@@ -36,7 +36,7 @@ class Guard:
     def path_of(self, path: str) -> str | None:
         """What is asked for below the token; None where the token is missing or wrong."""
         given, slash, rest = path.partition("?")[0].removeprefix("/").partition("/")
-        known = hmac.compare_digest(given.encode(), self.token.encode())
+        known = hmac.compare_digest(given.encode(errors="backslashreplace"), self.token.encode())
         return f"/{rest}" if known and (slash or not rest) else None
 
     def allows(self, origin: str | None, host: str | None) -> bool:
