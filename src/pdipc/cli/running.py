@@ -73,8 +73,10 @@ def run(
     stop = Stop()
     try:
         with stop.after_steps(), bar_of_steps(total, Console(stderr=True)) as bar:
-            from pdipc.simulation import run_scene
-            from pdipc.sweeps.worlds import run_worlds
+            if several:
+                from pdipc.sweeps.worlds import run_worlds as run
+            else:
+                from pdipc.simulation import run_scene as run
 
             def advance(info: "StepInfo") -> None:
                 nonlocal total
@@ -83,7 +85,6 @@ def run(
                 stop.step_done(info.step)
 
             options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
-            run = run_worlds if several else run_scene
             run(loaded, folder, steps=steps, device=device, progress=advance, **options)
     except KeyboardInterrupt:
         if stop.done is None:

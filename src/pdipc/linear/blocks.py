@@ -82,8 +82,10 @@ class BlockMatrix:
         mirror = np.searchsorted(keys, turned)
         mirrored = keys[np.minimum(mirror, self.nnz - 1)] == turned if self.nnz else np.zeros(0, dtype=bool)
         gathered = np.flatnonzero(~mirrored | (at < keys % n))
-        order = np.argsort(key, kind="stable")
+        order = np.lexsort((slot % 2, key))  # those to be transposed come last
         first, end = (np.searchsorted(key[order], keys[gathered], side=side) for side in ("left", "right"))
+        turns = np.concatenate([[0], np.cumsum(slot[order] % 2)])
+        middle = end - (turns[end] - turns[first])
         scalars = np.zeros(self.nnz)
         scalars[np.searchsorted(keys, fixed_key)] = fixed[inside]
         offsets = np.searchsorted(keys, np.arange(n + 1) * n)
@@ -99,9 +101,9 @@ class BlockMatrix:
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.held = wp.array(np.where(free, held, 0.0), dtype=real.scalar, device=device.warp)
         self._unrestrained = wp.clone(self.held)
-        self._first, self._end, self._places = (upload(each, wp.int32) for each in (first, end, gathered))
+        self._first, self._middle, self._end, self._places = (upload(each, wp.int32) for each in (first, middle, end, gathered))
         self._mirrors = upload(np.where(mirrored, mirror, -1)[gathered], wp.int32)
-        self._slots = upload(slot[order], wp.int32)
+        self._slots = upload(slot[order] // 2, wp.int32)
         self._scalars = upload(scalars, real.scalar)
         self._blocks = projector.blocks  # made now: recording must not allocate
         self._kernels = kernels(real)
@@ -115,7 +117,17 @@ class BlockMatrix:
         """Launches the values at x = base + u; project: see `Hessians`."""
         k, device = self._kernels, self.device
         self.projector.differentiate(base, u, project)
-        inputs = [self._first, self._end, self._slots, self._places, self._mirrors, self._scalars, self._blocks, self.values]
+        inputs = [
+            self._first,
+            self._middle,
+            self._end,
+            self._slots,
+            self._places,
+            self._mirrors,
+            self._scalars,
+            self._blocks,
+            self.values,
+        ]
         device.launch(k.gather, self._gathered, inputs, grain=16)
         device.launch(k.gather_diagonal, self.count, [self.offsets, self.held, self.values, self.diagonal], grain=32)
 
@@ -137,6 +149,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def gather(
         first: int,
         begins: wp.array(dtype=wp.int32),
+        middles: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
         slots: wp.array(dtype=wp.int32),
         places: wp.array(dtype=wp.int32),
@@ -145,16 +158,14 @@ def kernels(real: Real) -> SimpleNamespace:
         blocks: wp.array(dtype=mat33),
         values_out: wp.array(dtype=mat33),
     ):
-        """The sum of the elements' blocks; an odd slot is one to be transposed."""
+        """The sum of the elements' blocks; from `middles` on they are to be transposed."""
         e = first + wp.tid()
         total = mat33()
         turned = mat33()
-        for k in range(begins[e], ends[e]):
-            s = slots[k]
-            if s % 2 == 0:
-                total += blocks[s // 2]
-            else:
-                turned += blocks[s // 2]
+        for k in range(begins[e], middles[e]):
+            total += blocks[slots[k]]
+        for k in range(middles[e], ends[e]):
+            turned += blocks[slots[k]]
         total += wp.transpose(turned)
         c = scalars[places[e]]
         total[0, 0] = total[0, 0] + c

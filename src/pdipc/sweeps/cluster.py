@@ -40,7 +40,7 @@ def cores() -> int:
 @contextmanager
 def cluster_of(scheduler: str | None, workers: int) -> Iterator["Client"]:
     """A client of the cluster at an address, or of one of processes on this machine, which end with it."""
-    import dask
+    import dask.config
     from distributed import Client, LocalCluster
 
     if scheduler is not None:
