@@ -74,8 +74,9 @@ def measure(name: str, young: float) -> list[dict]:
 
 def draw(rows: list[dict], file: Path) -> None:
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
-    figure, axes = plt.subplots(2, len(STIFFNESS), figsize=(15, 6.2), sharey="row", layout="constrained")
+    figure, axes = plt.subplots(2, len(STIFFNESS), figsize=(15, 6.2), sharex="row", sharey="row", layout="constrained")
     for column, case in enumerate(STIFFNESS):
         for solver, color in zip(SOLVERS, ("#2f6fb0", "#d1702b"), strict=True):
             own = [row for row in rows if row["case"] == case and row.get("solver") == solver]
@@ -87,21 +88,27 @@ def draw(rows: list[dict], file: Path) -> None:
                 axis.plot(across[done], error[done], "o", color=color)
                 axis.plot(across[~done], error[~done], "x", color=color)
                 axis.grid(alpha=0.3)
+                axis.xaxis.set_minor_formatter(NullFormatter())
         axes[0, column].set_title(case)
         axes[0, column].set_xlabel("ms of the processor")
         axes[1, column].set_xlabel("iterations")
     for axis in axes[:, 0]:
         axis.set_ylabel("error, m")
-    axes[0, 0].legend(frameon=False)
+    axes[0, 0].plot([], [], "x", color="black", label="not converged, and told so")
+    axes[0, 0].legend(frameon=False, fontsize=8)
     figure.savefig(file, dpi=110)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--drawn", action="store_true", help="draws what the output file holds already")
     parser.add_argument("-o", "--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     os.environ.setdefault("PDIPC_THREADS", "1")
+    if options.drawn:
+        draw(json.loads(options.output.read_text())["rows"], options.picture)
+        return
     rows = [row for name, young in STIFFNESS.items() for row in measure(name, young)]
     machine = {
         "machine": platform.processor() or platform.machine(),
