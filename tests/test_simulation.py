@@ -98,6 +98,17 @@ def test_an_interrupt_after_a_step_loses_nothing(tmp_path):
     assert resumed == [3, 4, 5, 6]
 
 
+@pytest.mark.parametrize("lost", ["all of it", "its last row"])
+def test_checkpoints_that_are_no_state_of_the_scene_are_named(lost, tmp_path):
+    pdipc.run_scene(small(steps=1), tmp_path / "run")
+    for path in (tmp_path / "run/checkpoints").glob("*.npz"):
+        with np.load(path) as found:
+            arrays = {} if lost == "all of it" else {name: array[:-1] if array.ndim else array for name, array in found.items()}
+        np.savez(path, **arrays)
+    with pytest.raises(RunError, match=r"000001\.npz holds no state of this scene: .*; delete it, or start again"):
+        pdipc.run_scene(small(steps=1), tmp_path / "run", resume=True)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_kills_at_random_moments(tmp_path):
     """A few of what benchmarks/kills.py does by the hundred."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pdipc.output.results import Run, RunWriter
 
 CHECKPOINT_SECONDS = 10.0  # a checkpoint is written when the last one is older
+STATES = ("positions", "velocities", "accelerations", "remainders")  # arrays of a checkpoint with a row for each vertex
 
 
 @dataclass
@@ -285,6 +286,21 @@ def _first_difference(a: Any, b: Any, path: str = "") -> str | None:
     return next(filter(None, (_first_difference(mine, other, where) for where, mine, other in inner)), None)
 
 
+def _go_on_from(checkpoint: tuple[int, dict[str, np.ndarray]], simulation: Simulation, writer: "RunWriter") -> None:
+    """Puts the simulation into the state of a checkpoint. Raises RunError where its arrays are whole, and no state of this scene."""
+    from pdipc.output.results import RunError
+
+    try:
+        state, right = simulation.model.state_from(checkpoint[1]), simulation.state.positions.shape
+        if wrong := [name for name in STATES if getattr(state, name).shape != right]:
+            raise ValueError(f"its {wrong[0]} have the shape {getattr(state, wrong[0]).shape}; those of the scene {right}")
+    except (LookupError, TypeError, ValueError, RuntimeError) as error:
+        path = writer.folder / "checkpoints" / f"{checkpoint[0]:06d}.npz"
+        said = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise RunError(f"{path} holds no state of this scene: {said}; delete it, or start again with --overwrite") from error
+    simulation.state = state
+
+
 def running(
     simulation: Simulation,
     writer: "RunWriter",
@@ -296,7 +312,7 @@ def running(
     """A run from its last checkpoint, or the start where there is none, to the end, as a task (`launch.Task`)."""
     checkpoint = writer.latest_checkpoint()
     if checkpoint is not None:
-        simulation.state = simulation.model.state_from(checkpoint[1])
+        _go_on_from(checkpoint, simulation, writer)
     else:
         ignoring = simulation.work.quarantine.names(simulation.state.quarantined)
         writer.append(0, 0.0, simulation.positions, {"quarantined": ignoring} if ignoring else {})
