@@ -14,7 +14,11 @@ def fallen(size: float, precision: str, steps: int = 25) -> np.ndarray:
     """Where the middles of a block and of a cloth that lands on it are, in sizes: stiffnesses, densities and time are such that the motion is the same."""
     block = solid("block", (size,) * 3, (3, 3, 3), at=(0, 0.85 * size, 0), rotation=(10, 20, 5), young=1e6 * size)
     sheet = cloth("sheet", (2 * size, 2 * size), (10, 10), at=(0, 1.9 * size, 0))
-    sheet["material"] = {"areal_density": 2 * size, "membrane_stiffness": 1e4 * size**2, "bending_stiffness": min(1e6, 0.1 * size**4)}
+    sheet["material"] = {
+        "areal_density": 2 * size,
+        "membrane_stiffness": 1e4 * size**2,
+        "bending_stiffness": min(1e6, 0.1 * size**4),
+    }
     made = scene(
         [block, sheet],
         [floor(10 * size)],
