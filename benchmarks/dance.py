@@ -21,11 +21,7 @@ from pdipc.scene.generators import Capsule
 from pdipc.simulation import stats_of
 
 FRAMES, INTERVAL = 60, 0.04  # s
-CLOTH = {
-    "areal_density": 0.128,
-    "membrane_stiffness": 2000.0,
-    "bending_stiffness": 5.2e-5,
-}  # woven polyester, docs/materials.md
+CLOTH = {"areal_density": 0.128, "membrane_stiffness": 2000.0, "bending_stiffness": 5.2e-5}  # woven polyester, docs/materials.md
 WAIST, NARROW = (0.0, 0.85, -0.02), (0.7, 1.0, 0.7)  # where the skirt goes, m, and its scale
 
 
@@ -110,7 +106,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("PDIPC_DATA", "../shared/data")))
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--substeps", type=int, default=4, help="Steps in a frame.")
+    parser.add_argument("--substeps", type=int, default=6, help="Steps in a frame.")
     parser.add_argument("--figure", action="store_true", help="The figure of capsules.")
     parser.add_argument("--limit", type=float, help="The cloth's limit of stretch, such as 0.08.")
     parser.add_argument("--out", type=Path, default=Path("results/dance"))

@@ -97,6 +97,9 @@ def longest_edges(vertices: np.ndarray, elements: np.ndarray) -> np.ndarray:
 
 def flat_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(m,) bool: which triangles have no area to speak of."""
+    size = np.abs(vertices).max(initial=0.0)
+    if not 1e-100 < size < 1e100 and 0.0 < size < np.inf:  # whose squares would overflow, or vanish
+        vertices = vertices / size
     return triangle_areas(vertices, triangles) <= FLAT * longest_edges(vertices, triangles) ** 2
 
 
