@@ -21,7 +21,11 @@ from pdipc.scene.generators import Capsule
 from pdipc.simulation import stats_of
 
 FRAMES, INTERVAL = 60, 0.04  # s
-CLOTH = {"areal_density": 0.128, "membrane_stiffness": 2000.0, "bending_stiffness": 5.2e-5}  # woven polyester, docs/materials.md
+CLOTH = {
+    "areal_density": 0.128,
+    "membrane_stiffness": 2000.0,
+    "bending_stiffness": 5.2e-5,
+}  # woven polyester, docs/materials.md
 WAIST, NARROW = (0.0, 0.85, -0.02), (0.7, 1.0, 0.7)  # where the skirt goes, m, and its scale
 
 
