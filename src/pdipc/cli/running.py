@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -24,6 +24,15 @@ class Precision(StrEnum):
     auto = "auto"
     float32 = "float32"
     float64 = "float64"
+
+
+def _runner(several: bool) -> Callable[..., Any]:
+    """What runs a scene, or its worlds; imported late, since `--help` is to be quick."""
+    if several:
+        from pdipc.sweeps.worlds import run_worlds as run
+    else:
+        from pdipc.simulation import run_scene as run
+    return run
 
 
 # Arguments: the options of the command.
@@ -73,10 +82,6 @@ def run(
     stop = Stop()
     try:
         with stop.after_steps(), bar_of_steps(total, Console(stderr=True)) as bar:
-            if several:
-                from pdipc.sweeps.worlds import run_worlds as run
-            else:
-                from pdipc.simulation import run_scene as run
 
             def advance(info: "StepInfo") -> None:
                 nonlocal total
@@ -85,7 +90,7 @@ def run(
                 stop.step_done(info.step)
 
             options = {"resume": resume, "overwrite": overwrite, "certify": certify, "forces": forces}
-            run(loaded, folder, steps=steps, device=device, progress=advance, **options)
+            _runner(several)(loaded, folder, steps=steps, device=device, progress=advance, **options)
     except KeyboardInterrupt:
         if stop.done is None:
             typer.echo("pdipc: interrupted before a step was taken", err=True)
