@@ -16,49 +16,46 @@ from pdipc.device.launch import BLOCK, Device
 def kernels() -> SimpleNamespace:
     module = wp.get_module(__name__)
     module.options["enable_backward"] = False
-    block_total = blocks.total(wp.float64)
+    block_total, last_block = blocks.total(wp.float64), blocks.last()
 
     @kernel(module)
-    def add_blocks(
+    def add(
         first: int,
         starts: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
+        body_of: wp.array(dtype=wp.int32),
         values: wp.array(dtype=wp.float64),
         more: wp.array(dtype=wp.float64),
         own: int,
-        partial_out: wp.array(dtype=wp.float64),
+        offsets: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        partial: wp.array(dtype=wp.float64),
+        arrived: wp.array(dtype=wp.int32),
+        total_out: wp.array(dtype=wp.float64),
     ):
-        """The first `own` blocks are of `values`, the others of `more`."""
+        """The first `own` blocks are of `values`, the others of `more`; the last of a body to be done adds up the body's."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
         total = wp.float64(0.0)
-        for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
+        for i in range(starts[b] + lane, ends[b], wp.block_dim()):
             if b < own:
                 total += values[i]
             else:
                 total += more[i]
         total = block_total(total)
-        if worker % wp.block_dim() == 0:
-            partial_out[b] = total
+        if lane == 0:
+            partial[b] = total
+        body = body_of[b]
+        if last_block(arrived, body, offsets[body + 1] - offsets[body]):
+            total = wp.float64(0.0)
+            for k in range(offsets[body] + lane, offsets[body + 1], wp.block_dim()):
+                total += partial[listed[k]]
+            total = block_total(total)
+            if lane == 0:
+                total_out[body] = total
 
-    @kernel(module)
-    def add_bodies(
-        first: int,
-        offsets: wp.array(dtype=wp.int32),
-        listed: wp.array(dtype=wp.int32),
-        partial: wp.array(dtype=wp.float64),
-        total_out: wp.array(dtype=wp.float64),
-    ):
-        worker = first + wp.tid()
-        body = worker // wp.block_dim()
-        total = wp.float64(0.0)
-        for k in range(offsets[body] + worker % wp.block_dim(), offsets[body + 1], wp.block_dim()):
-            total += partial[listed[k]]
-        total = block_total(total)
-        if worker % wp.block_dim() == 0:
-            total_out[body] = total
-
-    return SimpleNamespace(add_blocks=add_blocks, add_bodies=add_bodies)
+    return SimpleNamespace(add=add)
 
 
 class BodySums:
@@ -84,17 +81,16 @@ class BodySums:
         body = np.concatenate([*bodies_of_blocks, np.zeros(0, dtype=np.int64)])
         order = np.argsort(body, kind="stable")
         self._offsets = wp.array(np.searchsorted(body[order], np.arange(bodies + 1)).astype(np.int32), device=device.warp)
-        self._blocks = self._upload(order)
+        self._blocks, self._body_of = self._upload(order), self._upload(body)
+        self._arrived = wp.zeros(max(1, bodies), dtype=wp.int32, device=device.warp)
         self._partial = wp.zeros(max(1, at), dtype=wp.float64, device=device.warp)
 
     def _upload(self, values: np.ndarray) -> wp.array:
         return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=self.device.warp)
 
     def add(self, arrays: list[wp.array], total_out: wp.array) -> None:
-        """Launches total_out[b] = sum of the entries of body b over all arrays."""
+        """Launches total_out[b] = sum of the entries of body b over all arrays; of a body without entries it stays as it is."""
         if self._count:
-            inputs = [self._starts, self._ends, arrays[0], arrays[-1], self._own, self._partial]
-            self.device.launch_blocks(self._kernels.add_blocks, self._count, inputs, grain=BLOCK // 4)
-        if self.bodies:
-            inputs = [self._offsets, self._blocks, self._partial, total_out]
-            self.device.launch_blocks(self._kernels.add_bodies, self.bodies, inputs, grain=1)
+            inputs = [self._starts, self._ends, self._body_of, arrays[0], arrays[-1], self._own]
+            inputs += [self._offsets, self._blocks, self._partial, self._arrived, total_out]
+            self.device.launch_blocks(self._kernels.add, self._count, inputs, grain=BLOCK // 4)

@@ -229,13 +229,11 @@ def kernels(real: Real) -> SimpleNamespace:
         u_end_out: wp.array(dtype=vec3),
         x_end_out: wp.array(dtype=vec3),
         passes_out: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
     ):
         """A part of the step, and of the rotation of the body: where on the arc, not on its chord."""
         i = first + wp.tid()
         if i == 0:
             passes_out[0] = 1  # what is not shortened has been proven already
-            going_out[0] = 1
         b = body[i]
         if b >= 0 and accepted[wp.max(b, 0)] == 0:
             f = least[label[b]]
@@ -723,7 +721,7 @@ class Descent:
                 device.launch_blocks(k.least_fraction, self.bodies, inputs, grain=1000)
                 device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
             which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
-            motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
+            motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes]
             device.launch(k.turn_back, n, [*which, *motion])
             w.candidates.check(w.x, t.x_end)
             device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, t.x_end))
