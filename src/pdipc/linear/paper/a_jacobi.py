@@ -28,7 +28,7 @@ from numpy.polynomial import Chebyshev as ChebyshevSeries
 from numpy.polynomial import Polynomial
 
 from pdipc.device import language
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct_of
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition
@@ -252,11 +252,15 @@ class AJacobi(Solver):
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         placed = np.zeros(max(1, len(columns)), dtype=np.int32)
         placed[positions] = columns
-        arrays = [starts, vertices, first_rows, placed, offsets]
-        self._group_arrays = [wp.array(np.resize(a, max(1, a.size)).astype(np.int32), device=self.device.warp) for a in arrays]
+        self._neighbourhoods = made = neighbourhoods_of(self.real)()
+        arrays = {"starts": starts, "vertices": vertices, "first_rows": first_rows, "columns": placed, "offsets": offsets}
+        for name, values in arrays.items():
+            values = np.resize(values, max(1, values.size)).astype(np.int32)
+            setattr(made, name, wp.array(values, device=self.device.warp))
+        made.coefficients = self.zeros(self.real.scalar, len(placed))
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
         self._group_kernels = group_kernels(self.real, limit)
-        return positions, self.zeros(self.real.scalar, len(placed))
+        return positions, made.coefficients
 
     def prepare(self, contact: Contact | None) -> None:
         """Launches the inverse of the diagonal, and with it the A-coefficients (Eq. 14)."""
@@ -271,7 +275,6 @@ class AJacobi(Solver):
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         sums, status_kernels = self.sums, jacobi.kernels(self.real)
@@ -280,14 +283,14 @@ class AJacobi(Solver):
         self._form_constant(x, b)
         self.copy(self._x, x)
         self.copy(self._before, x)
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        status = self.status
         self._sweep(self._x, self._before, -1)
-        sums.conclude(status_kernels.begin, [*self._sum, reference, *self.limits, *status])
+        sums.conclude(status_kernels.begin, [*self._sum, status])
 
         def iterate() -> None:
             self._sweep(self._x, self._before, 0)
             self._sweep(self._before, self._x, 1)
-            sums.conclude(status_kernels.check, [*self._sum, CHECK, CHECK, *self.limits, *status])
+            sums.conclude(status_kernels.check, [*self._sum, CHECK, CHECK, status])
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -298,24 +301,24 @@ class AJacobi(Solver):
 
     def _form_constant(self, x: wp.array, b: wp.array) -> None:
         """Launches q(G) D^-1 b by Horner's rule, with the part of the matrix on prescribed vertices taken to the right."""
-        k, count, matrix = self._kernels, self.system.count, self.system.rows.arguments
+        k, count, matrix = self._kernels, self.system.count, self.system.rows.operand
         self.device.launch(k.prescribed, count, [self.inverse, x, self._v], grain=8)
-        self.device.launch(k.right_side, count, [*matrix, self.inverse, b, self._v, self._before], grain=32)
+        self.device.launch(k.right_side, count, [matrix, self.inverse, b, self._v, self._before], grain=32)
         source, target = self._v, self._constant
         self.device.launch(k.scale, count, [self.inverse, self._before, self._quotient[-1], source], grain=8)
         for d in reversed(self._quotient[:-1]):
-            self.device.launch(k.horner, count, [*matrix, self.inverse, self._before, d, source, target], grain=32)
+            self.device.launch(k.horner, count, [matrix, self.inverse, self._before, d, source, target], grain=32)
             source, target = target, source
         if source is not self._constant:
             self.copy(self._constant, source)
 
     def _sweep(self, source: wp.array, target: wp.array, step: int) -> None:
-        state = [self.total, self._constant, self._factors, self.left, self.limits[1], step, source, target]
+        state = [self.total, self._constant, jacobi.course_of(self, self._factors), step, source, target]
         if self.grouped:
-            inputs = [*self._group_arrays, self._values, *state, self._group_partial]
+            inputs = [self._neighbourhoods, *state, self._group_partial]
             self.sums.launch_groups(self._group_kernels.grouped_sweep, self.groups, inputs)
         else:
-            self.sums.launch(self._kernels.sweep, [*self.coefficients.arguments, *state, self.partial])
+            self.sums.launch(self._kernels.sweep, [self.coefficients.operand, *state, self.partial])
 
 
 def _quotient(coefficients: np.ndarray) -> np.ndarray:
@@ -324,9 +327,16 @@ def _quotient(coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
+def neighbourhoods_of(real: Real) -> Any:
+    """A struct: groups of vertices, what each reads, and its rows of p(G), as `AJacobi._plan` lays them out."""
+    integers = {name: wp.array(dtype=wp.int32) for name in ("starts", "vertices", "first_rows", "columns", "offsets")}
+    return struct_of("Neighbourhoods", __name__, **integers, coefficients=wp.array(dtype=real.scalar))
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     """Kernels over vertices and over entries."""
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Entries, Course = real.scalar, real.vec3, sparse_rows.entries(real), jacobi.course(real)
     module = real.module(__name__)
     f = shared.functions(real)
 
@@ -374,9 +384,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def right_side(
         first: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
+        rows: Entries,
         inverse: wp.array(dtype=scalar),
         b: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -384,7 +392,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """D^-1 (b - A x), with x zero on free vertices."""
         i = first + wp.tid()
-        d_out[i] = inverse[i] * (b[i] - f.row_product(i, offsets, columns, values, x))
+        d_out[i] = inverse[i] * (b[i] - f.row_product(i, rows, x))
 
     @kernel(module)
     def scale(
@@ -397,9 +405,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def horner(
         first: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
+        rows: Entries,
         inverse: wp.array(dtype=scalar),
         d: wp.array(dtype=vec3),
         factor: scalar,
@@ -408,21 +414,17 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """v_out = factor d + G v."""
         i = first + wp.tid()
-        v_out[i] = factor * d[i] - inverse[i] * f.row_product(i, offsets, columns, values, v)
+        v_out[i] = factor * d[i] - inverse[i] * f.row_product(i, rows, v)
 
     @kernel(module)
     def sweep(
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
+        coefficients: Entries,
         diagonal: wp.array(dtype=scalar),
         constant: wp.array(dtype=vec3),
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        course: Course,
         step: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -432,18 +434,18 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         omega = scalar(0.0)
         if step >= 0:
-            omega = factors[max_iterations - left[0] + step]
+            omega = course.factors[course.max_iterations - course.left[0] + step]
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if diagonal[i] > scalar(0.0):
-                y = constant[i] + f.row_product(i, offsets, columns, coefficients, x)
+                y = constant[i] + f.row_product(i, coefficients, x)
                 d = y - x[i]
                 gamma += diagonal[i] * wp.dot(d, d)
                 last = before[i]
                 before[i] = last + omega * (y - last)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(update=update, prescribed=prescribed, right_side=right_side, scale=scale, horner=horner, sweep=sweep)
 
 
 # The group's neighbourhood and, stretch by stretch, its coefficients are fetched to fast memory by all threads together; SEGMENTS
@@ -461,15 +463,15 @@ _GROUPED_SWEEP = """
     int staged_column[STAGE];
     const int segments = 1;
 #endif
-    const int base = starts.data[group];
-    const int count = starts.data[group + 1] - base;
-    const int* vertex = vertices.data + base;
+    const int base = groups.starts.data[group];
+    const int count = groups.starts.data[group + 1] - base;
+    const int* vertex = groups.vertices.data + base;
     for (int k = lane; k < count; k += lanes) {
         const auto& p = x.data[vertex[k]];
         cache[3 * k] = p.c[0]; cache[3 * k + 1] = p.c[1]; cache[3 * k + 2] = p.c[2];
     }
-    const int* offset = offsets.data + first_rows.data[group];
-    const int rows = first_rows.data[group + 1] - first_rows.data[group];
+    const int* offset = groups.offsets.data + groups.first_rows.data[group];
+    const int rows = groups.first_rows.data[group + 1] - groups.first_rows.data[group];
     const int segment = lane % segments, at_once = lanes / segments;
     SCALAR gamma = 0;
     for (int first = 0; first < rows; first += at_once) {
@@ -481,8 +483,8 @@ _GROUPED_SWEEP = """
             const int stop = begin + STAGE < end ? begin + STAGE : end;
             MEET;  // the last stretch was used, or the neighbourhood is complete
             for (int e = begin + lane; e < stop; e += lanes) {
-                staged[e - begin] = coefficients.data[e];
-                staged_column[e - begin] = columns.data[e];
+                staged[e - begin] = groups.coefficients.data[e];
+                staged_column[e - begin] = groups.columns.data[e];
             }
             MEET;
             int e = low > begin ? low : begin;
@@ -525,7 +527,7 @@ def capacity_on_cuda(real: Real) -> int:
 @functools.cache
 def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     """The kernel for groups that read up to `capacity` vertices."""
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Course, Neighbourhoods = real.scalar, real.vec3, jacobi.course(real), neighbourhoods_of(real)
     module = real.module(f"{__name__}.{capacity}")
     f = shared.functions(real)
     source = (
@@ -537,12 +539,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         group: int,
         lane: int,
         lanes: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        first_rows: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
+        groups: Neighbourhoods,
         diagonal: wp.array(dtype=scalar),
         constant: wp.array(dtype=vec3),
         omega: scalar,
@@ -553,17 +550,10 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     @kernel(module)
     def grouped_sweep(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        first_rows: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
+        groups: Neighbourhoods,
         diagonal: wp.array(dtype=scalar),
         constant: wp.array(dtype=vec3),
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        course: Course,
         step: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -573,26 +563,11 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         worker = first + wp.tid()
         omega = scalar(0.0)
         if step >= 0:
-            omega = factors[max_iterations - left[0] + step]
+            omega = course.factors[course.max_iterations - course.left[0] + step]
         lanes = wp.block_dim()
         group = worker // lanes
         lane = worker % lanes
-        gamma = group_step(
-            group,
-            lane,
-            lanes,
-            starts,
-            vertices,
-            first_rows,
-            columns,
-            offsets,
-            coefficients,
-            diagonal,
-            constant,
-            omega,
-            x,
-            before,
-        )
+        gamma = group_step(group, lane, lanes, groups, diagonal, constant, omega, x, before)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(grouped_sweep=grouped_sweep)
