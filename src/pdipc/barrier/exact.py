@@ -275,38 +275,27 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
+        o: Hessian,
         free: wp.array(dtype=scalar),
         energy: wp.array(dtype=wp.float64),
         slope: wp.array(dtype=mat43),
-        lever: wp.array(dtype=mat43),
-        hessian: wp.array(dtype=scalar),
         force_out: wp.array(dtype=vec3),
         diagonal_out: wp.array(dtype=mat33),
         energy_out: wp.array(dtype=wp.float64),
     ):
         """Of each vertex: the force, the block of the Hessian, and the energy of the pairs whose first free vertex it is."""
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         force = vec3()
         d = mat33()
         own = wp.float64(0.0)
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            s = entries[i] % 4
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            s = o.entries[i] % 4
             force -= row(slope[k], s)
-            j = row(lever[k], s)
-            d += hessian[k] * wp.outer(j, j)
-            if free[v] > zero:
-                before = zero
-                for t in range(4):
-                    if t < s:
-                        before += free[quads[k][t]]
-                if before == zero:
+            j = row(o.lever[k], s)
+            d += o.hessian[k] * wp.outer(j, j)
+            if free[v] > zero:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                if pairs.counts_here(o.quads[k], s, free):
                     own += energy[k]
         force_out[v] = force
         diagonal_out[v] = d
@@ -428,8 +417,13 @@ class BarrierTerm(ActivePairs):
         result = [self.energy_of_pair, self.slope, self.lever, self.hessian]
         bent = [self.bend, self.first_bent, self.second_bent]
         device.launch_list(k.differentiate, self.capacity, [self.frozen, x, *result, *bent])
-        inputs = [self.ends, self.entries, self.quads, self.free, *result]
-        device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+        self.gather_pairs()
+
+    def gather_pairs(self) -> None:
+        """Launches what the pairs give each vertex: force, block of the Hessian, energy."""
+        result = [self.force_of_vertex, self.diagonal, self.energy_of_vertex]
+        inputs = [self.operand(), self.free, self.energy_of_pair, self.slope, *result]
+        self.device.launch(self.exact.gather, len(self.ends), inputs)
 
     def pushed(self) -> Exerted:
         """The barrier's forces where it was last differentiated, and what restitution added. Not recordable."""

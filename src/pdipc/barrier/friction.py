@@ -112,10 +112,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def evaluate(
         span: Span,
-        count: wp.array(dtype=wp.int32),
+        o: Hessian,
         u: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
         normals: wp.array(dtype=vec3),
         limit: wp.array(dtype=scalar),
         threshold: scalar,
@@ -126,10 +124,10 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Energy, J; the force per unit of witness weight, N; and the block of the Hessian, N/m."""
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
+        for b in range(worker * span.block, o.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, o.count[0])):
                 n = normals[k]
-                s = slip(quads[k], weights[k], n, u)
+                s = slip(o.quads[k], o.weights[k], n, u)
                 size = wp.length(s)
                 rate = limit[k] * barrier.smoothed_coulomb(size, threshold)
                 length, rising = dissipation(size, threshold)
@@ -147,37 +145,26 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
+        o: Hessian,
         free: wp.array(dtype=scalar),
         energy: wp.array(dtype=wp.float64),
         force: wp.array(dtype=vec3),
-        block: wp.array(dtype=mat33),
         force_out: wp.array(dtype=vec3),
         diagonal_out: wp.array(dtype=mat33),
         energy_out: wp.array(dtype=wp.float64),
     ):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         total = vec3()
         d = mat33()
         own = wp.float64(0.0)
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            s = entries[i] % 4
-            a = weights[k][s]
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            s = o.entries[i] % 4
+            a = o.weights[k][s]
             total += a * force[k]
-            d += (a * a) * block[k]
-            if free[v] > zero:
-                before = zero
-                for t in range(4):
-                    if t < s:
-                        before += free[quads[k][t]]
-                if before == zero:
+            d += (a * a) * o.block[k]
+            if free[v] > zero:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                if pairs.counts_here(o.quads[k], s, free):
                     own += energy[k]
         force_out[v] = total
         diagonal_out[v] = d
@@ -275,10 +262,10 @@ class FrictionTerm:
         is to be a bound that never overshoots.
         """
         k, device = self.kernels, self.device
-        inputs = [self.count, u, self.quads, self.weights, self.normals, self.limit, self.threshold, project]
-        result = [self.energy_of_pair, self.force, self.block]
-        device.launch_list(k.evaluate, self.capacity, [*inputs, *result])
-        inputs = [self.ends, self.entries, self.quads, self.weights, self.source.free, *result]
+        o = self.operand()
+        inputs = [o, u, self.normals, self.limit, self.threshold, project]
+        device.launch_list(k.evaluate, self.capacity, [*inputs, self.energy_of_pair, self.force, self.block])
+        inputs = [o, self.source.free, self.energy_of_pair, self.force]
         device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
 
     def rubbed(self) -> Exerted:

@@ -313,7 +313,9 @@ class AJacobi(Solver):
             self.copy(self._constant, source)
 
     def _sweep(self, source: wp.array, target: wp.array, step: int) -> None:
-        state = [self.total, self._constant, jacobi.course_of(self, self._factors), step, source, target]
+        o = aggregated(self.real)()
+        o.diagonal, o.constant = self.total, self._constant
+        state = [o, jacobi.course_of(self, self._factors), step, source, target]
         if self.grouped:
             inputs = [self._neighbourhoods, *state, self._group_partial]
             self.sums.launch_groups(self._group_kernels.grouped_sweep, self.groups, inputs)
@@ -327,6 +329,13 @@ def _quotient(coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
+def aggregated(real: Real) -> Any:
+    """A struct: what an aggregated step has beside p(G)."""
+    constant = wp.array(dtype=real.vec3)  # q(G) D^-1 b, m
+    return struct_of("Aggregated", __name__, diagonal=wp.array(dtype=real.scalar), constant=constant)
+
+
+@functools.cache
 def neighbourhoods_of(real: Real) -> Any:
     """A struct: groups of vertices, what each reads, and its rows of p(G), as `AJacobi._plan` lays them out."""
     integers = {name: wp.array(dtype=wp.int32) for name in ("starts", "vertices", "first_rows", "columns", "offsets")}
@@ -336,7 +345,8 @@ def neighbourhoods_of(real: Real) -> Any:
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     """Kernels over vertices and over entries."""
-    scalar, vec3, Entries, Course = real.scalar, real.vec3, sparse_rows.entries(real), jacobi.course(real)
+    scalar, vec3, Entries = real.scalar, real.vec3, sparse_rows.entries(real)
+    Course, Aggregated = jacobi.course(real), aggregated(real)
     module = real.module(__name__)
     f = shared.functions(real)
 
@@ -422,8 +432,7 @@ def kernels(real: Real) -> SimpleNamespace:
         share: int,
         count: int,
         coefficients: Entries,
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
+        o: Aggregated,
         course: Course,
         step: int,
         x: wp.array(dtype=vec3),
@@ -437,10 +446,10 @@ def kernels(real: Real) -> SimpleNamespace:
             omega = course.factors[course.max_iterations - course.left[0] + step]
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
-            if diagonal[i] > scalar(0.0):
-                y = constant[i] + f.row_product(i, coefficients, x)
+            if o.diagonal[i] > scalar(0.0):
+                y = o.constant[i] + f.row_product(i, coefficients, x)
                 d = y - x[i]
-                gamma += diagonal[i] * wp.dot(d, d)
+                gamma += o.diagonal[i] * wp.dot(d, d)
                 last = before[i]
                 before[i] = last + omega * (y - last)
         f.store_sum(gamma, worker, partial_out)
@@ -504,13 +513,13 @@ _GROUPED_SWEEP = """
             const int v = vertex[row];
             SCALAR square = 0;
             for (int c = 0; c < 3; ++c) {
-                y[c] += constant.data[v].c[c];
+                y[c] += o.constant.data[v].c[c];
                 const SCALAR d = y[c] - cache[3 * row + c];
                 square += d * d;
                 SCALAR& last = before.data[v].c[c];
                 last += omega * (y[c] - last);
             }
-            gamma += diagonal.data[v] * square;
+            gamma += o.diagonal.data[v] * square;
         }
     }
     return gamma;
@@ -527,7 +536,8 @@ def capacity_on_cuda(real: Real) -> int:
 @functools.cache
 def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     """The kernel for groups that read up to `capacity` vertices."""
-    scalar, vec3, Course, Neighbourhoods = real.scalar, real.vec3, jacobi.course(real), neighbourhoods_of(real)
+    scalar, vec3 = real.scalar, real.vec3
+    Course, Aggregated, Neighbourhoods = jacobi.course(real), aggregated(real), neighbourhoods_of(real)
     module = real.module(f"{__name__}.{capacity}")
     f = shared.functions(real)
     source = (
@@ -540,8 +550,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         lane: int,
         lanes: int,
         groups: Neighbourhoods,
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
+        o: Aggregated,
         omega: scalar,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -551,8 +560,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     def grouped_sweep(
         first: int,
         groups: Neighbourhoods,
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
+        o: Aggregated,
         course: Course,
         step: int,
         x: wp.array(dtype=vec3),
@@ -567,7 +575,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         lanes = wp.block_dim()
         group = worker // lanes
         lane = worker % lanes
-        gamma = group_step(group, lane, lanes, groups, diagonal, constant, omega, x, before)
+        gamma = group_step(group, lane, lanes, groups, o, omega, x, before)
         f.store_sum(gamma, worker, partial_out)
 
     return SimpleNamespace(grouped_sweep=grouped_sweep)
