@@ -136,6 +136,14 @@ def kernels(real: Real) -> SimpleNamespace:
         force_out[i] = -law.free[i] * law.mass[i] / (law.h * law.h) * (x_now[i] - x[i]) - elastic[i]
         increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
+    @func
+    def parted(pairs: Frozen, k: int, x_start: wp.array(dtype=vec3), x_now: wp.array(dtype=vec3)) -> scalar:
+        """How far the sides of pair k have moved apart along its normal, m."""
+        moved = vec3()
+        for s in range(4):
+            moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
+        return wp.dot(pairs.normals[k], moved)
+
     @kernel(module)
     def linearize(
         span: Span,
@@ -151,12 +159,9 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
                 friction_out[k] = scalar(0.0)
                 hessian_out[k] = pull[k]
-                force_out[k] = pull[k] * (target[k] - wp.dot(pairs.normals[k], moved)) * pairs.normals[k]
+                force_out[k] = pull[k] * (target[k] - parted(pairs, k, x_start, x_now)) * pairs.normals[k]
 
     @kernel(module)
     def linearize_exact(
@@ -174,10 +179,7 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
-                slope = pull[k] * (wp.dot(pairs.normals[k], moved) - target[k])
+                slope = pull[k] * (parted(pairs, k, x_start, x_now) - target[k])
                 lever = mat43()
                 for s in range(4):
                     for axis in range(3):
@@ -249,10 +251,7 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
-                rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(pairs.normals[k], moved))
+                rebound_out[k] = part[0] * pull[k] * (target[k] - parted(pairs, k, x_start, x_now))
 
     @kernel(module)
     def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):

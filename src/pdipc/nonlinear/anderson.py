@@ -99,7 +99,6 @@ def kernels(real: Real) -> SimpleNamespace:
                 total[2 * memory + 1] = squared
         partial_out[b] = total
 
-    # Long: one thread's bookkeeping and a small system, solved in place.
     @kernel(module)
     def mix(
         first: int,

@@ -444,7 +444,6 @@ def kernels(real: Real) -> SimpleNamespace:
         attempts_out[0] = 0
         count_out[status.MOVING] = 0
 
-    # Long: one decision, of all that was found out in an iteration.
     @kernel(module)
     def decide(
         first: int,
@@ -614,7 +613,6 @@ class Descent:
     force that would move a body as a whole: for methods whose motions say little of how much is left, such as local-global iterations of stiff bodies.
     """
 
-    # Long: all that lives as long as the solve is made here.
     def __init__(self, work, frictional: bool = True, descends: bool = True, weighs: bool = False):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count

@@ -348,7 +348,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, Entries = real.scalar, real.vec3, sparse_rows.entries(real)
     Course, Aggregated = jacobi.course(real), aggregated(real)
     module = real.module(__name__)
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), jacobi.omega_of(real)
 
     @kernel(module)
     def update(
@@ -441,9 +441,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """One aggregated step; `before` as in Jacobi's sweep. Step -1: only the norm of the step."""
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = course.factors[course.max_iterations - course.left[0] + step]
+        omega = omega_of_step(course, step)
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if o.diagonal[i] > scalar(0.0):
@@ -539,7 +537,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     Course, Aggregated, Neighbourhoods = jacobi.course(real), aggregated(real), neighbourhoods_of(real)
     module = real.module(f"{__name__}.{capacity}")
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), jacobi.omega_of(real)
     source = (
         _GROUPED_SWEEP.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)).replace("STAGE", str(STAGE))
     )
@@ -569,9 +567,7 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     ):
         """As `sweep`, for one group of vertices."""
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = course.factors[course.max_iterations - course.left[0] + step]
+        omega = omega_of_step(course, step)
         lanes = wp.block_dim()
         group = worker // lanes
         lane = worker % lanes

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from pdipc.device.language import kernel, struct_of
+from pdipc.device.language import Function, func, kernel, struct_of
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
@@ -124,6 +124,21 @@ def course(real: Real) -> Any:
     )
 
 
+@functools.cache
+def omega_of(real: Real) -> Function:
+    """The factor of sweep number `step` of the current group of sweeps; 0 for step -1."""
+    scalar, Course = real.scalar, course(real)
+
+    @func
+    def omega(course: Course, step: int) -> scalar:
+        factor = scalar(0.0)
+        if step >= 0:
+            factor = course.factors[course.max_iterations - course.left[0] + step]
+        return factor
+
+    return omega
+
+
 def course_of(solver: Solver, factors: wp.array, weight: float = 1.0) -> Any:
     """The struct for a solver."""
     made = course(solver.real)()
@@ -137,7 +152,7 @@ def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3 = real.scalar, real.vec3
     Equation, Status, Course = shared.equation(real), shared.status(real), course(real)
     module = real.module(__name__)
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), omega_of(real)
 
     @kernel(module)
     def sweep(
@@ -157,9 +172,7 @@ def kernels(real: Real) -> SimpleNamespace:
         w: the contacts' part of K x, which is left zero; absent where they have none.
         """
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = course.factors[course.max_iterations - course.left[0] + step]
+        omega = omega_of_step(course, step)
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             if k.inverse[i] != scalar(0.0):
