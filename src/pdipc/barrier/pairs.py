@@ -29,6 +29,7 @@ from pdipc.device import blocks
 from pdipc.device.language import Function, filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
+from pdipc.linear.contact_rows import first_entry
 
 FIRST_PAIRS = 1024  # room at first
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
@@ -49,6 +50,8 @@ def frozen(real: Real) -> Any:
         activation=wp.array(dtype=scalar),  # d_hat, m
         stiffness=wp.array(dtype=scalar),  # kappa m, N/m
         coefficient=wp.array(dtype=scalar),  # of friction
+        ends=wp.array(dtype=wp.int32),  # of each vertex, where its pairs end in
+        entries=wp.array(dtype=wp.int32),  # 4 pair + place
     )
 
 
@@ -63,9 +66,19 @@ def pair_stiffness(a: Scalar, b: Scalar, mollifier: Scalar):
     return mollifier * type(a)(0.5) * (a + b)
 
 
+@func
+def counts_here(q: wp.vec4i, s: int, free: wp.array(dtype=Scalar)) -> bool:
+    """Whether vertex s of a pair is the first that is free: with it the pair's energy is counted."""
+    first = bool(True)
+    for t in range(4):
+        if t < s and free[q[t]] > type(free[0])(0.0):
+            first = False
+    return first
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    Frozen, Pairs = frozen(real), candidates_of(real)
+    Frozen, Listed = frozen(real), candidates_of(real)
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     far = wp.constant(real.scalar(1.0e30))
@@ -124,8 +137,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def measure(
         span: Span,
-        points: Pairs,
-        lines: Pairs,
+        points: Listed,
+        lines: Listed,
         x: wp.array(dtype=vec3),
         ahead: wp.array(dtype=vec3),
         driven: wp.array(dtype=wp.int32),
@@ -164,40 +177,34 @@ def kernels(real: Real) -> SimpleNamespace:
                     points.gaps[k] = gap
 
     @func
-    def nearest_of_face(
-        k: int,
-        count: int,
-        quads: wp.array(dtype=wp.vec4i),
-        faces: wp.array(dtype=wp.int32),
-        gaps: wp.array(dtype=scalar),
-    ) -> bool:
+    def nearest_of_face(k: int, c: Listed) -> bool:
         """Whether no other triangle of its face is as near to the vertex of pair k, which has its pairs in a row; the first of equals is."""
         nearest = bool(True)
-        own = wp.abs(gaps[k])  # what is foreseen has a minus
-        if faces[k] >= 0:
+        own = wp.abs(c.gaps[k])  # what is foreseen has a minus
+        if c.faces[k] >= 0:
             for way in range(2):
                 step = 1 - 2 * way
                 j = k + step
-                while nearest and j >= 0 and j < count:
-                    if quads[j][0] != quads[k][0]:
-                        j = count
+                while nearest and j >= 0 and j < c.count[0]:
+                    if c.quads[j][0] != c.quads[k][0]:
+                        j = c.count[0]
                     else:
-                        other = wp.abs(gaps[j])
-                        if faces[j] == faces[k] and (other < own or (way == 1 and other == own)):
+                        other = wp.abs(c.gaps[j])
+                        if c.faces[j] == c.faces[k] and (other < own or (way == 1 and other == own)):
                             nearest = False
                         j += step
         return nearest
 
     @func
-    def acts(edges: bool, k: int, c: Pairs) -> bool:
+    def acts(edges: bool, k: int, c: Listed) -> bool:
         """Whether a pair is active; of those of a flat face one is."""
         active = c.gaps[k] < far
         if active and not edges:
-            active = nearest_of_face(k, c.count[0], c.quads, c.faces, c.gaps)
+            active = nearest_of_face(k, c)
         return active
 
     @func
-    def of_kind(edges: bool, points: Pairs, lines: Pairs) -> Pairs:
+    def of_kind(edges: bool, points: Listed, lines: Listed) -> Listed:
         if edges:
             return lines
         return points
@@ -205,8 +212,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def count_active(
         first: int,
-        points: Pairs,
-        lines: Pairs,
+        points: Listed,
+        lines: Listed,
         size: int,
         capacity: int,
         smallest: wp.array(dtype=scalar),
@@ -269,8 +276,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def freeze(
         first: int,
-        points: Pairs,
-        lines: Pairs,
+        points: Listed,
+        lines: Listed,
         size: int,
         ends: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vec3),
@@ -376,9 +383,7 @@ def kernels(real: Real) -> SimpleNamespace:
             for k in range(b, wp.min(b + span.block, count[0])):
                 for s in range(4):
                     v = quads[k][s]
-                    low = int(0)
-                    if v > 0:
-                        low = ends[v - 1]
+                    low = first_entry(v, ends)
                     before = int(0)
                     for i in range(low, ends[v]):
                         if entries[i] < k * 4 + s:
@@ -429,8 +434,6 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
         pairs: Frozen,
         friction: wp.array(dtype=scalar),
         share: wp.array(dtype=scalar),
@@ -441,14 +444,12 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Adds the contact forces to the right-hand side and makes the block diagonal that dominates the contact Hessian."""
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
+        low = first_entry(v, pairs.ends)
         total = vec3()
         d = mat33()
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            w = pairs.weights[k][entries[i] % 4]
+        for i in range(low, pairs.ends[v]):
+            k = pairs.entries[i] // 4
+            w = pairs.weights[k][pairs.entries[i] % 4]
             n = pairs.normals[k]
             total += w * force[k]
             scale = wp.abs(w) * share[k]
@@ -457,7 +458,7 @@ def kernels(real: Real) -> SimpleNamespace:
             d[0, 0] = d[0, 0] + f
             d[1, 1] = d[1, 1] + f
             d[2, 2] = d[2, 2] + f
-        if ends[v] > low:
+        if pairs.ends[v] > low:
             rhs[v] = rhs[v] + total
         diagonal_out[v] = d
 
@@ -480,22 +481,13 @@ def kernels(real: Real) -> SimpleNamespace:
                 response_out[k] = (hessian[k] - friction[k]) * wp.dot(n, u) * n + friction[k] * u
 
     @kernel(module)
-    def spread(
-        first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        response: wp.array(dtype=vec3),
-        y: wp.array(dtype=vec3),
-    ):
+    def spread(first: int, pairs: Frozen, response: wp.array(dtype=vec3), y: wp.array(dtype=vec3)):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        if ends[v] > low:
+        low = first_entry(v, pairs.ends)
+        if pairs.ends[v] > low:
             total = vec3()
-            for i in range(low, ends[v]):
-                total += weights[entries[i] // 4][entries[i] % 4] * response[entries[i] // 4]
+            for i in range(low, pairs.ends[v]):
+                total += pairs.weights[pairs.entries[i] // 4][pairs.entries[i] % 4] * response[pairs.entries[i] // 4]
             y[v] = y[v] + total
 
     @kernel(module)
@@ -531,11 +523,8 @@ def total_share(real: Real) -> Function:
 
     @func
     def total(v: int, ends: wp.array(dtype=wp.int32), shares: wp.array(dtype=vec3)) -> vec3:
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         total_of_vertex = vec3()
-        for i in range(low, ends[v]):
+        for i in range(first_entry(v, ends), ends[v]):
             total_of_vertex += shares[i]
         return total_of_vertex
 
@@ -581,11 +570,11 @@ class FrozenPairs:
         self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
         self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
         self.coefficient, self.friction = make(real.scalar), make(real.scalar)
-        self.frozen = filled(frozen(real), self)
         self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
+        self.frozen = filled(frozen(real), self)
         wide = 4 * capacity if self.device.wide else 1
         self.unsorted, self.places = (wp.zeros(wide, dtype=wp.int32, device=self.device.warp) for _ in range(2))
         self.shares = wp.zeros(wide, dtype=real.vec3, device=self.device.warp)
@@ -678,7 +667,7 @@ class ActivePairs(FrozenPairs):
 
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
-        inputs = [self.ends, self.entries, self.frozen, self.friction, self.share, self.hessian, self.force]
+        inputs = [self.frozen, self.friction, self.share, self.hessian, self.force]
         self.device.launch(self.kernels.gather, len(self.ends), [*inputs, rhs, self.diagonal])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
@@ -686,7 +675,7 @@ class ActivePairs(FrozenPairs):
         k = self.kernels
         inputs = [self.frozen, p, self.friction, self.hessian, self.response]
         self.device.launch_list(k.stretch, self.capacity, inputs)
-        self.device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
+        self.device.launch(k.spread, len(self.ends), [self.frozen, self.response, y])
 
 
 def listed(count: int, *arrays: wp.array) -> list[np.ndarray]:

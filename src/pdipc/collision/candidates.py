@@ -69,7 +69,7 @@ def vertices(real: Real) -> Any:
 
 @functools.cache
 def listed(real: Real) -> Any:
-    """A struct: the pairs of a `CandidateList` as kernels read them."""
+    """A struct: the candidates of one kind as kernels read them; see `CandidateList`."""
     return struct_of(
         "Listed",
         __name__,

@@ -21,6 +21,7 @@ drags every body of the scene (docs/paper_map.md).
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,7 +29,7 @@ import warp as wp
 from pdipc.collision import ccd, distance
 from pdipc.collision.candidates import Candidates, listed
 from pdipc.device import atomic
-from pdipc.device.language import func, kernel
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
@@ -44,11 +45,27 @@ MAX_PASSES = 60  # and after which all do
 
 
 @functools.cache
+def truncated(real: Real) -> Any:
+    """A struct: the motion that is left, and how the passes stand; see `Truncation`."""
+    return struct_of(
+        "Truncated",
+        __name__,
+        fraction=wp.array(dtype=real.scalar),
+        first_fraction=wp.array(dtype=real.scalar),
+        u_end=wp.array(dtype=real.vec3),
+        x_end=wp.array(dtype=real.vec3),
+        passes=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, vec4 = real.scalar, real.vec2, real.vec3, real.vec4
+    Truncated, Listed = truncated(real), listed(real)
     module = real.module(__name__)
-    c, Pairs = ccd.functions(real), listed(real)
+    c = ccd.functions(real)
     unit = wp.constant(UNIT)
+
     lower = atomic.lower()
 
     @func
@@ -67,13 +84,11 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def sweep(
         span: Span,
-        points: Pairs,
-        lines: Pairs,
+        points: Listed,
+        lines: Listed,
         x: wp.array(dtype=vec3),
-        x_end: wp.array(dtype=vec3),
-        fraction: wp.array(dtype=scalar),
-        passes: wp.array(dtype=wp.int32),
-        island_of: wp.array(dtype=wp.int32),
+        o: Truncated,
+        body: wp.array(dtype=wp.int32),
         rigid: wp.array(dtype=wp.int32),
         multiplier: wp.array(dtype=wp.int32),
         any_hit_out: wp.array(dtype=wp.int32),
@@ -84,10 +99,10 @@ def kernels(real: Real) -> SimpleNamespace:
         """
         worker = span.first + wp.tid()
         backoff = scalar(FIRST_BACKOFF)
-        if passes[0] > 0:
+        if o.passes[0] > 0:
             backoff = scalar(LATER_BACKOFF)
         count = points.count[0] + lines.count[0]
-        if passes[0] > MAX_PASSES:
+        if o.passes[0] > MAX_PASSES:
             count = 0  # nobody moves
         for begin in range(worker * span.block, count, span.step * span.block):
             for k in range(begin, wp.min(begin + span.block, count)):
@@ -100,31 +115,31 @@ def kernels(real: Real) -> SimpleNamespace:
                 else:
                     q = points.quads[k]
                     reach = points.limits[k]
-                shortest = wp.min(wp.min(fraction[q[0]], fraction[q[1]]), wp.min(fraction[q[2]], fraction[q[3]]))
+                shortest = wp.min(wp.min(o.fraction[q[0]], o.fraction[q[1]]), wp.min(o.fraction[q[2]], o.fraction[q[3]]))
                 t = scalar(2.0)
-                if (passes[0] == 0 or shortest < scalar(1.0)) and reach[1] >= scalar(0.0):
+                if (o.passes[0] == 0 or shortest < scalar(1.0)) and reach[1] >= scalar(0.0):
                     if edges:
                         t = c.edge_edge(
                             x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                            x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], reach[0], backoff, reach[1],
+                            o.x_end[q[0]], o.x_end[q[1]], o.x_end[q[2]], o.x_end[q[3]], reach[0], backoff, reach[1],
                         )  # fmt: skip
                     else:
                         t = c.vertex_triangle(
                             x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                            x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], reach[0], backoff, reach[1],
+                            o.x_end[q[0]], o.x_end[q[1]], o.x_end[q[2]], o.x_end[q[3]], reach[0], backoff, reach[1],
                         )  # fmt: skip
                 if t <= scalar(1.0):
                     any_hit_out[0] = 1
                     time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
                     apart = scalar(distance.pair_distance(edges, x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                     if apart - reach[0] < scalar(DEEP) * reach[1]:
-                        if island_of[q[0]] >= 0:
-                            deep_out[island_of[q[0]]] = 1
-                        if island_of[q[3]] >= 0:
-                            deep_out[island_of[q[3]]] = 1
+                        if body[q[0]] >= 0:
+                            deep_out[body[q[0]]] = 1
+                        if body[q[3]] >= 0:
+                            deep_out[body[q[3]]] = 1
                     held = bool(True)
-                    if passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
-                        held = not withdraws(edges, q, x, x_end, rigid)
+                    if o.passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
+                        held = not withdraws(edges, q, x, o.x_end, rigid)
                     for s in range(4):
                         if held or rigid[q[s]] == 0:
                             lower(multiplier, q[s], time)
@@ -172,30 +187,24 @@ def kernels(real: Real) -> SimpleNamespace:
             fraction[members[k]] = least
 
     @kernel(module)
-    def shorten(
-        first: int,
-        passes: wp.array(dtype=wp.int32),
-        multiplier: wp.array(dtype=wp.int32),
-        fraction: wp.array(dtype=scalar),
-        first_fraction: wp.array(dtype=scalar),
-    ):
+    def shorten(first: int, multiplier: wp.array(dtype=wp.int32), t: Truncated):
         """Clears the times for the next pass."""
         i = first + wp.tid()
         if multiplier[i] < unit:
             shrink = scalar(1.0)
-            if passes[0] > 0:
+            if t.passes[0] > 0:
                 shrink = scalar(SHRINK)
-            f = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
-            if passes[0] >= STUBBORN:
+            f = t.fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
+            if t.passes[0] >= STUBBORN:
                 # not settled: these stay where they are, and the next outer iteration starts from a stronger barrier
                 f = scalar(0.0)
-            fraction[i] = f
-            if passes[0] == 0:
-                first_fraction[i] = f
+            t.fraction[i] = f
+            if t.passes[0] == 0:
+                t.first_fraction[i] = f
             multiplier[i] = int(unit)
-        if passes[0] >= MAX_PASSES:
+        if t.passes[0] >= MAX_PASSES:
             # nobody moves, which is always feasible
-            fraction[i] = scalar(0.0)
+            t.fraction[i] = scalar(0.0)
 
     @kernel(module)
     def grade(
@@ -226,22 +235,19 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
-        fraction: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
+        t: Truncated,
         least_out: wp.array(dtype=wp.int32),
-        passes: wp.array(dtype=wp.int32),
         any_hit_out: wp.array(dtype=wp.int32),
     ):
         """Where shortened vertices end; the next pass begins."""
         i = first + wp.tid()
-        if fraction[i] < scalar(1.0):
-            u_end_out[i] = u[i] + fraction[i] * (u_tilde[i] - u[i])
-            x_end_out[i] = base[i] + u_end_out[i]
+        if t.fraction[i] < scalar(1.0):
+            t.u_end[i] = u[i] + t.fraction[i] * (u_tilde[i] - u[i])
+            t.x_end[i] = base[i] + t.u_end[i]
         if i < groups:
             least_out[i] = unit
         if i == 0:
-            passes[0] = passes[0] + 1
+            t.passes[0] = t.passes[0] + 1
             any_hit_out[0] = 0
 
     @kernel(module)
@@ -250,25 +256,31 @@ def kernels(real: Real) -> SimpleNamespace:
         bodies: int,
         base: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
-        fraction_out: wp.array(dtype=scalar),
-        first_fraction_out: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
+        t_out: Truncated,
         deep_out: wp.array(dtype=wp.int32),
-        passes_out: wp.array(dtype=wp.int32),
     ):
         """The whole motion."""
         i = first + wp.tid()
-        fraction_out[i] = scalar(1.0)
-        first_fraction_out[i] = scalar(1.0)
-        u_end_out[i] = u_tilde[i]
-        x_end_out[i] = base[i] + u_tilde[i]
+        t_out.fraction[i] = scalar(1.0)
+        t_out.first_fraction[i] = scalar(1.0)
+        t_out.u_end[i] = u_tilde[i]
+        t_out.x_end[i] = base[i] + u_tilde[i]
         if i < bodies:
             deep_out[i] = 0
         if i == 0:
-            passes_out[0] = 0
+            t_out.passes[0] = 0
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        sweep=sweep,
+        together=together,
+        find_least=find_least,
+        spread_least=spread_least,
+        level=level,
+        shorten=shorten,
+        grade=grade,
+        place=place,
+        begin=begin,
+    )
 
 
 class Truncation:
@@ -277,7 +289,8 @@ class Truncation:
     neighbours: offsets (n + 1,) and columns of those that elasticity
     connects, or None. bodies: vertices (k,) of those that move as four points do, and so keep one time. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
     set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
-    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
+    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device. truncated: these as
+    kernels take them.
     """
 
     def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True, bodies: Sequence[np.ndarray] = ()):
@@ -294,6 +307,7 @@ class Truncation:
         self.bodies = list(bodies)
         self.keep_rigid([])
         self.passes, self.any_hit = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(2))
+        self.truncated = filled(truncated(real), self)
 
     def keep_rigid(self, groups: list[np.ndarray]) -> None:
         """Vertices (k,) of each obstacle that must stay rigid: these share one time. What was recorded has to be recorded again."""
@@ -318,8 +332,7 @@ class Truncation:
 
         base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
         """
-        first = [self.fraction, self.first_fraction, self.u_end, self.x_end, self.deep, self.passes]
-        self.device.launch(self.kernels.begin, self.n, [self.body_count, base, u_tilde, *first])
+        self.device.launch(self.kernels.begin, self.n, [self.body_count, base, u_tilde, self.truncated, self.deep])
         self.prove(candidates, base, u, u_tilde, x)
 
     def prove(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
@@ -330,8 +343,7 @@ class Truncation:
 
         def sweep() -> None:
             pairs = [each.listed for each in candidates.lists]
-            motion = [x, self.x_end, self.fraction, self.passes, self.body, self.rigid]
-            inputs = [*pairs, *motion, self.multiplier, self.any_hit, self.deep]
+            inputs = [*pairs, x, self.truncated, self.body, self.rigid, self.multiplier, self.any_hit, self.deep]
             device.launch_list(k.sweep, candidates.capacity, inputs)
 
         def shorten() -> None:
@@ -340,15 +352,14 @@ class Truncation:
                 device.launch(k.spread_least, n, [self.group_of, self.least, self.multiplier])
             elif self.group_count:
                 device.launch(k.together, self.group_count, [self.group_ends, self.group_members, self.multiplier])
-            device.launch(k.shorten, n, [self.passes, self.multiplier, self.fraction, self.first_fraction])
+            device.launch(k.shorten, n, [self.multiplier, self.truncated])
             if self.neighbours is not None:
                 for _ in range(RINGS // 2):
                     for before, after in ((self.fraction, self.graded), (self.graded, self.fraction)):
                         device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
                 if self.bodies:
                     device.launch(k.level, self.group_count, [self.group_ends, self.group_members, self.fraction])
-            ends = [self.u_end, self.x_end, self.least, self.passes, self.any_hit]
-            device.launch(k.place, n, [self.group_count, base, u, u_tilde, self.fraction, *ends])
+            device.launch(k.place, n, [self.group_count, base, u, u_tilde, self.truncated, self.least, self.any_hit])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
             sweep()

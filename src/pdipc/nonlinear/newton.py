@@ -27,7 +27,6 @@ scripted goes from waypoint to waypoint, an outer iteration each where nothing i
 import functools
 from types import SimpleNamespace
 
-import numpy as np
 import warp as wp
 
 from pdipc.barrier import exact, friction
@@ -38,11 +37,12 @@ from pdipc.device.language import func, kernel
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.integration import status
+from pdipc.integration.script import led
 from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, curved, widened
+from pdipc.nonlinear.descent import Descent, bodies, curved, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
@@ -66,7 +66,7 @@ def sampled(k: int, number: int, count: int) -> int:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Led, Bodies = real.scalar, real.vec3, led(real), bodies(real)
     module = real.module(__name__)
     wide = wp.float64
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
@@ -115,38 +115,28 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def look_ahead(
         first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        o: Led,
         z: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
         ahead_out: wp.array(dtype=vec3),
         driven_out: wp.array(dtype=wp.int32),
     ):
         """Where vertices are going: what is driven to its target, others as inertia has it in the first iteration, and nowhere later."""
         i = first + wp.tid()
-        place = base[i] + u[i]
+        place = o.base[i] + o.u[i]
         driven_out[i] = 0
-        if free[i] == scalar(0.0):
-            if drive[wp.max(mover[i], 0)] != 0 and mover[i] >= 0:
-                place = target[i]
+        if o.free[i] == scalar(0.0):
+            if o.drive[wp.max(o.mover[i], 0)] != 0 and o.mover[i] >= 0:
+                place = o.target[i]
                 driven_out[i] = 1
         elif count[status.OUTER] == 0:
-            place = base[i] + z[i]
+            place = o.base[i] + z[i]
         ahead_out[i] = place
 
     @kernel(module)
     def begin(
         first: int,
-        u: wp.array(dtype=vec3),
-        base: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
+        o: Led,
         barrier: wp.array(dtype=vec3),
         friction: wp.array(dtype=vec3),
         rhs: wp.array(dtype=vec3),
@@ -157,18 +147,15 @@ def kernels(real: Real) -> SimpleNamespace:
         total = rhs[i] + barrier[i]
         if friction:
             total += friction[i]
-        rhs[i] = free[i] * total
+        rhs[i] = o.free[i] * total
         p_out[i] = vec3()
-        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
-            p_out[i] = (target[i] - base[i]) - u[i]
+        if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
+            p_out[i] = (o.target[i] - o.base[i]) - o.u[i]
 
     @kernel(module)
     def find_turn(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        whole: wp.array(dtype=wp.int32),
-        mass: wp.array(dtype=scalar),
+        bodies: Bodies,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -180,10 +167,10 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        start = starts[b]
-        count = ends[b] - start
+        start = bodies.starts[b]
+        count = bodies.ends[b] - start
         number = wp.min(count, SAMPLES)
-        if whole[b] == 0:
+        if bodies.whole[b] == 0:
             number = 0
         origin = base[start]
         total = wide(0.0)
@@ -191,7 +178,7 @@ def kernels(real: Real) -> SimpleNamespace:
         mean = wp.vec3d()
         for k in range(lane, number, wp.block_dim()):
             i = start + sampled(k, number, count)
-            m = wide(mass[i])
+            m = wide(bodies.mass[i])
             total += m
             center += m * widened((base[i] - origin) + u[i])
             mean += m * widened(p[i])
@@ -206,7 +193,7 @@ def kernels(real: Real) -> SimpleNamespace:
         outer = wp.mat33d()
         for k in range(lane, number, wp.block_dim()):
             i = start + sampled(k, number, count)
-            m = wide(mass[i])
+            m = wide(bodies.mass[i])
             arm = widened((base[i] - origin) + u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
@@ -228,16 +215,11 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def propose(
         first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        o: Led,
         p: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
         body: wp.array(dtype=wp.int32),
         center: wp.array(dtype=wp.vec3d),
         turn: wp.array(dtype=wp.vec3d),
-        target: wp.array(dtype=vec3),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
         stretch: wp.array(dtype=scalar),
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
@@ -249,16 +231,16 @@ def kernels(real: Real) -> SimpleNamespace:
         if not (moved < scalar(1.0e30)):
             moved = scalar(wp.inf)
             step = vec3()
-        if free[i] > scalar(0.0):
+        if o.free[i] > scalar(0.0):
             step = stretch[0] * step
         b = body[i]
         if b >= 0 and moved < scalar(wp.inf):
-            step += vec3(curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
-        u_tilde = u[i] + step
-        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
-            u_tilde = target[i] - base[i]  # to the bit, so that it is known to have arrived
+            step += vec3(curved(widened(o.base[i] + o.u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
+        u_tilde = o.u[i] + step
+        if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
+            u_tilde = o.target[i] - o.base[i]  # to the bit, so that it is known to have arrived
         u_tilde_out[i] = u_tilde
-        x_tilde_out[i] = base[i] + u_tilde
+        x_tilde_out[i] = o.base[i] + u_tilde
 
     @kernel(module)
     def any_driven(first: int, movers: int, drive: wp.array(dtype=wp.int32), any_out: wp.array(dtype=wp.int32)):
@@ -328,7 +310,20 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] > scalar(0.0):
             p[i] = vec3()
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        measure=measure,
+        lengthen=lengthen,
+        look_ahead=look_ahead,
+        begin=begin,
+        find_turn=find_turn,
+        propose=propose,
+        any_driven=any_driven,
+        set_flag=set_flag,
+        choose=choose,
+        compare=compare,
+        leave_saddle=leave_saddle,
+        restart=restart,
+    )
 
 
 class Newton(Descent):
@@ -351,8 +346,7 @@ class Newton(Descent):
         def zeros(dtype, count=n):
             return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
 
-        whole = [free[low:high].all() for low, high in self.ranges]
-        self.whole = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
+        self.unheld = self._bodies([bool(free[low:high].all()) for low, high in self.ranges])
         vec3, scalar = real.vec3, real.scalar
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.forces, self.scales = (zeros(scalar) for _ in range(3))
@@ -392,9 +386,9 @@ class Newton(Descent):
 
     def _foresee(self) -> None:
         """What is scripted will push what is in its way: pairs that it is about to close push already, where it will be."""
-        w, model = self.work, self.model
-        inputs = [w.x_start, w.u, w.z, w.script.target, model.free, w.script.mover, w.script.drive, w.count]
-        self.device.launch(self.kernels.look_ahead, model.vertex_count, [*inputs, w.x_tilde, self.driven])
+        w = self.work
+        inputs = [w.led(), w.z, w.count, w.x_tilde, self.driven]
+        self.device.launch(self.kernels.look_ahead, self.model.vertex_count, inputs)
         w.candidates.check(w.x, w.x_tilde)
         self.device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, w.x_tilde))
         self.pairs.freeze(w.candidates, w.x, w.x_tilde, self.driven)
@@ -409,8 +403,8 @@ class Newton(Descent):
         w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
         model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
         friction = None if self.friction is None else self.friction.force_of_vertex
-        where = [w.u, w.x_start, w.script.target, model.free, w.script.mover, w.script.drive]
-        device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        led = w.led()
+        device.launch(k.begin, n, [led, self.pairs.force_of_vertex, friction, self.rhs, self.p])
         if self.affine is not None:
             self.affine.fold(self.rhs)
         device.when(self.renew, self._assemble)
@@ -423,11 +417,9 @@ class Newton(Descent):
         states = [self.project, self.hits, self.attempts, w.count]
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
         if self.bodies:
-            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p]
-            inputs += [self.stretch, self.center, self.turn]
+            inputs = [self.unheld, w.x_start, w.u, self.p, self.stretch, self.center, self.turn]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
-        inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn]
-        inputs += [w.script.target, w.script.mover, w.script.drive, self.stretch]
+        inputs = [led, self.p, self.islands.body, self.center, self.turn, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
     def _assemble(self) -> None:
@@ -467,22 +459,9 @@ class Newton(Descent):
         self.matrix.restrain(self.islands.body, self.unrestrained)
         self.matrix.assemble(w.x_start, w.u, self.project)
         r.linearize_exact(w.rest)
-        self.device.launch(
-            self.kernels.begin,
-            n,
-            [
-                w.u,
-                w.x_start,
-                w.script.target,
-                model.free,
-                w.script.mover,
-                self.nobody,
-                self.pairs.force_of_vertex,
-                None,
-                r.zero,
-                self.p,
-            ],
-        )
+        led = w.led()
+        led.drive = self.nobody
+        self.device.launch(self.kernels.begin, n, [led, self.pairs.force_of_vertex, None, r.zero, self.p])
         couplings = [each for each in self._couplings() if each is not self.friction]
         self.solver.prepare(w.x, couplings)
         self.solver.solve(self.p, r.zero, couplings, 0.0, self.nobody, REBOUND_TOLERANCE[model.real.name])
