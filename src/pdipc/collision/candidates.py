@@ -31,7 +31,7 @@ from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
 from pdipc.device import blocks
 from pdipc.device.language import filled, func, kernel, struct_of
-from pdipc.device.launch import BLOCK, CPU_BLOCK, REDUCE_BLOCK, Device, Parts, Span
+from pdipc.device.launch import BLOCK, CPU_BLOCK, REDUCE_BLOCK, Device, Parts, Share, Span
 from pdipc.device.precision import Real, Scalar
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
@@ -175,11 +175,9 @@ def kernels(real: Real) -> SimpleNamespace:
         begin: wp.array(dtype=vec3),
         end: wp.array(dtype=vec3),
         margin: scalar,
-        parts: int,
-        size: int,
+        parts: Share,
         overflow: wp.array(dtype=wp.int32),
         away: wp.array(dtype=wp.int32),
-        arrived: wp.array(dtype=wp.int32),
         needed_out: wp.array(dtype=wp.int32),
         renewed_out: wp.array(dtype=wp.int32),
     ):
@@ -188,7 +186,7 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        for i in range(block * size + lane, wp.min((block + 1) * size, x0.shape[0]), wp.block_dim()):
+        for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, x0.shape[0]), wp.block_dim()):
             # whoever writes, writes the same
             if not near(x0[i], begin[i], margin):
                 away[0] = 1
@@ -198,7 +196,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 away[2] = 1
             if not near(x1[i], end[i], margin):
                 away[3] = 1
-        if last_block(arrived, 0, parts):  # noqa: SIM102  (all threads of a block ask)
+        if last_block(parts.arrived, 0, parts.number):  # noqa: SIM102  (all threads of a block ask)
             if lane == 0:
                 needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
                 if overflow[0] != 0:
@@ -374,16 +372,6 @@ class Candidates:
         It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
         """
         parts = self._parts
-        inputs = [
-            x0,
-            x1,
-            self.begin,
-            self.end,
-            self.real.scalar(self.margin),
-            parts.number,
-            parts.size,
-            self.overflow,
-            self.away,
-        ]
-        inputs += [parts.arrived, self.needed, self.renewed]
+        inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), parts.share, self.overflow]
+        inputs += [self.away, self.needed, self.renewed]
         self.device.launch_blocks(self.kernels.check, parts.number, inputs, grain=REDUCE_BLOCK)

@@ -30,7 +30,7 @@ import warp as wp
 
 from pdipc.device import blocks, system
 from pdipc.device import threads as shared
-from pdipc.device.language import Kernel, func, kernel, struct
+from pdipc.device.language import Kernel, filled, func, kernel, struct
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
 
@@ -404,29 +404,27 @@ def kernels(real: Real) -> SimpleNamespace:
         b: wp.array(dtype=scalar),
         c: wp.array(dtype=scalar),
         counts: wp.vec3i,
-        parts: int,
-        size: int,
+        parts: Share,
         slots: wp.vec3i,
         partial: wp.array(dtype=scalar),
-        arrived: wp.array(dtype=wp.int32),
         out: wp.array(dtype=scalar),
     ):
-        """A block of threads a part of `size` numbers, of which each array has so many."""
+        """A block of threads a part of the numbers, of which each array has so many."""
         worker = first + wp.tid()
         block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        which = block // parts
-        begin = wp.min((block - which * parts) * size, counts[which] - 1)
+        which = block // parts.number
+        begin = wp.min((block - which * parts.number) * parts.size, counts[which] - 1)
         largest = one_of(which, begin, a, b, c)
-        for i in range(begin + lane, wp.min(begin + size, counts[which]), wp.block_dim()):
+        for i in range(begin + lane, wp.min(begin + parts.size, counts[which]), wp.block_dim()):
             largest = wp.max(largest, one_of(which, i, a, b, c))
         largest = block_largest(largest)
         if lane == 0:
             partial[block] = largest
-        if last_block(arrived, which, parts):
-            largest = partial[which * parts]
-            for k in range(lane, parts, wp.block_dim()):
-                largest = wp.max(largest, partial[which * parts + k])
+        if last_block(parts.arrived, which, parts.number):
+            largest = partial[which * parts.number]
+            for k in range(lane, parts.number, wp.block_dim()):
+                largest = wp.max(largest, partial[which * parts.number + k])
             largest = block_largest(largest)
             if lane == 0:
                 out[slots[which]] = largest
@@ -436,26 +434,24 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         values: wp.array(dtype=scalar),
         count: int,
-        parts: int,
-        size: int,
+        parts: Share,
         slot: int,
         partial: wp.array(dtype=scalar),
-        arrived: wp.array(dtype=wp.int32),
         out: wp.array(dtype=scalar),
     ):
-        """A block of threads a part of `size` numbers."""
+        """A block of threads a part of the numbers."""
         worker = first + wp.tid()
         block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
         total = scalar(0.0)
-        for i in range(block * size + lane, wp.min((block + 1) * size, count), wp.block_dim()):
+        for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, count), wp.block_dim()):
             total += values[i]
         total = block_total(total)
         if lane == 0:
             partial[block] = total
-        if last_block(arrived, 0, parts):
+        if last_block(parts.arrived, 0, parts.number):
             total = scalar(0.0)
-            for k in range(lane, parts, wp.block_dim()):
+            for k in range(lane, parts.number, wp.block_dim()):
                 total += partial[k]
             total = block_total(total)
             if lane == 0:
@@ -464,16 +460,26 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(find_largest=find_largest, add_up=add_up)
 
 
+@struct
+class Share:
+    """`Parts` as kernels take them."""
+
+    number: int
+    size: int
+    arrived: wp.array[wp.int32]
+
+
 class Parts:
     """How `count` entries are cut for blocks of threads that finish together: `number` parts of `size` entries.
 
-    arrived: int32 on the device, the counters of `blocks.last`, of so many `slots`.
+    arrived: int32 on the device, the counters of `blocks.last`, of so many `slots`. share: these as kernels take them.
     """
 
     def __init__(self, device: Device, count: int, slots: int = 1):
         self.size = max(REDUCE_BLOCK, -(-count // WIDE_BLOCKS)) if device.wide else REDUCE_BLOCK
         self.number = max(1, -(-count // self.size))
         self.arrived = wp.zeros(slots, dtype=wp.int32, device=device.warp)
+        self.share = filled(Share, self)
 
 
 class Largest:
@@ -488,8 +494,7 @@ class Largest:
     def find(self, values: Sequence[wp.array], out: wp.array, slots: Sequence[int]) -> None:
         """Launches out[slots[k]] = largest of values[k]."""
         parts, fill = self.parts, 3 - self.arrays
-        inputs = [*values, *[values[0]] * fill, self.counts, parts.number, parts.size]
-        inputs += [wp.vec3i(*slots, *[0] * fill), self.partial, parts.arrived, out]
+        inputs = [*values, *[values[0]] * fill, self.counts, parts.share, wp.vec3i(*slots, *[0] * fill), self.partial, out]
         self.device.launch_blocks(self.kernels.find_largest, self.arrays * parts.number, inputs, grain=REDUCE_BLOCK // 8)
 
 
@@ -505,7 +510,7 @@ class Reducer:
     def sum(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = sum of values[0:count], always in the same order on a device."""
         parts = self.parts
-        inputs = [values, self.count, parts.number, parts.size, slot, self.partial, parts.arrived, out]
+        inputs = [values, self.count, parts.share, slot, self.partial, out]
         self.device.launch_blocks(self.kernels.add_up, parts.number, inputs, grain=REDUCE_BLOCK // 8)
 
     def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
