@@ -1,7 +1,6 @@
 """The model: what stays constant during a simulation, assembled once from a scene; and the state that a step changes."""
 
 import functools
-import os
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from pdipc.collision import faces, surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
+from pdipc.device.threads import thread_count_for
 from pdipc.integration.loads import ExternalForces
 from pdipc.integration.script import Reached
 from pdipc.linear.affine import Follower
@@ -29,12 +29,10 @@ from pdipc.scene.errors import SceneWarning
 from pdipc.scene.schema import Scene, uses_newton
 from pdipc.scene.worlds import refuse_worlds
 
-ALONE = 400  # vertices of a model that one thread steps: two would lose more in waiting for each other than they win, on a busy machine most
 DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
 # The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
 DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": {"barrier": "pcg", "paper": "a-jacobi"}}
-
 
 TOLERANCE_SPEED, TOLERANCE_PART = 0.01, 1e-3  # the default: m/s, and the part of the smallest body's size
 
@@ -222,18 +220,13 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     refuse_worlds(scene, "a model")
     assembly.masses = masses
     sim = scene.simulation
-    place = device if isinstance(device, Device) else Device(device or sim.device, threads_for(len(assembly.positions)))
+    place = device if isinstance(device, Device) else Device(device or sim.device, thread_count_for(len(assembly.positions)))
     number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
     told = len(assembly.notes)
     refuse(scene, assembly, number.name)
     for note in assembly.notes[told:]:
         warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene.settled(), assembly, place, number)
-
-
-def threads_for(vertices: int) -> int | None:
-    """CPU threads of a model of so many vertices; None for as many as there may be, which PDIPC_THREADS always says by itself."""
-    return 1 if vertices <= ALONE and not os.environ.get("PDIPC_THREADS", "").strip() else None
 
 
 def reassembled(model: Model, assembly: Assembly) -> Model:

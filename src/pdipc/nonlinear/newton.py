@@ -42,7 +42,7 @@ from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, curved, widened
+from pdipc.nonlinear.descent import Descent, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
 MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
@@ -216,9 +216,7 @@ def kernels(real: Real) -> SimpleNamespace:
         outer = total_matrix(outer)
         turn = wp.vec3d()
         if number > 0:
-            # a little more than the inertia, for bodies on a line
-            turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * momentum
-            turn = wide(stretch[0]) * turn
+            turn = wide(stretch[0]) * turned(square, outer, momentum)
             if not (wp.length(turn) < wide(MOST_TURN)):
                 turn = wp.vec3d()
         if lane == 0:
