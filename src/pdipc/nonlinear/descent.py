@@ -472,13 +472,16 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.IDLE] = count[status.IDLE] + 1
             if lowered[0] != 0 or count[status.MOVING] != 0 or script[ARRIVED] != 0:
                 count[status.IDLE] = 0
+            most_rounded = scalar(ROUNDED) * tolerance
             if projected[0] != 0:
                 left = left / scalar(EXACT)
+                most_rounded = scalar(EXACT) * most_rounded
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= most_change
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
-            if count[status.IDLE] >= most_idle and left <= scalar(ROUNDED) * tolerance:
+            # and where nothing falls for long, motions are rounding's: their ratios say nothing
+            if count[status.IDLE] >= most_idle and wp.max(residual, numbers[status.UNBALANCED]) <= most_rounded:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
             if residual >= scalar(wp.inf):
