@@ -91,6 +91,13 @@ def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
     return result
 
 
+@func
+def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
+    """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
+    # a little more than the inertia, for bodies on a line
+    return wp.inverse(wp.float64(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wp.float64) - outer) * momentum
+
+
 @struct
 class Energies:
     """The potential of each body, J: at x and where it is tried, without friction and that alone; and of its island."""
@@ -127,6 +134,7 @@ def limits(real: Real) -> Any:
         tolerance=real.scalar,  # m
         most_change=real.scalar,  # of a barrier's curvature, in parts of it
         max_outer=int,
+        most_idle=int,  # outer iterations
         budget_ms=wp.float64,
     )
 
@@ -423,8 +431,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             left = wide(0.0)
             if total > wide(0.0) and square > wide(0.0):
-                # a little more than the inertia, for bodies on a line
-                turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * torque
+                turn = turned(square, outer, torque)
                 left = wide(h) * wide(h) * (wp.length(force) / total + wp.sqrt(square / total) * wp.length(turn))
             left_out[b] = scalar(left)
 
@@ -536,8 +543,10 @@ def kernels(real: Real) -> SimpleNamespace:
             progress.count[status.IDLE] = progress.count[status.IDLE] + 1
             if search.lowered[0] != 0 or progress.count[status.MOVING] != 0 or script[ARRIVED] != 0:
                 progress.count[status.IDLE] = 0
+            most_rounded = scalar(ROUNDED) * limits.tolerance
             if search.project[0] != 0:
                 left = left / scalar(EXACT)
+                most_rounded = scalar(EXACT) * most_rounded
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = (
                 left <= limits.tolerance
@@ -546,7 +555,11 @@ def kernels(real: Real) -> SimpleNamespace:
             )
             if search.attempts[0] > 1 and search.lowered[0] == 0 and residual <= scalar(EXACT) * limits.tolerance:
                 done = True
-            if progress.count[status.IDLE] >= IDLE and left <= scalar(ROUNDED) * limits.tolerance:
+            # and where nothing falls for long, motions are rounding's: their ratios say nothing
+            if (
+                progress.count[status.IDLE] >= limits.most_idle
+                and wp.max(residual, progress.numbers[status.UNBALANCED]) <= most_rounded
+            ):
                 done = True
             settled = done and search.hits[0] == 0 and progress.count[status.MOVING] == 0 and search.restrained[0] == 0
             if residual >= scalar(wp.inf):
@@ -555,7 +568,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 code = status.CONVERGED
             elif settled and script[WILL] == 0:
                 code = status.LAGGING
-            elif progress.count[status.STALLED] >= STALLS or progress.count[status.IDLE] >= IDLE:
+            elif progress.count[status.STALLED] >= STALLS or progress.count[status.IDLE] >= limits.most_idle:
                 code = status.STALLING
             elif (
                 limits.budget_ms > wide(0.0) and progress.clock[status.LAST] - progress.clock[status.STARTED] > limits.budget_ms
@@ -706,6 +719,9 @@ class Descent:
         self.energies, self.search = filled(Energies, self), filled(Search, self)
         self.limits = limits(real)()
         self.limits.tolerance, self.limits.max_outer = settings.tolerance, settings.max_outer
+        self.limits.most_idle = (
+            IDLE if descends else settings.max_outer
+        )  # what need not lower the potential does not idle where it does not
         self.limits.most_change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
         self.limits.budget_ms = settings.budget_ms or 0.0
         self.motion = motion(real)()
@@ -716,8 +732,9 @@ class Descent:
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
         self.weighs = weighs and any(whole)
         self.balanced = self._bodies(whole)
-        self.unbalanced = zeros(scalar, self.bodies)
-        self.largest_of_bodies = Largest(device, real, [max(1, self.bodies)])
+        if self.weighs:
+            self.unbalanced = zeros(scalar, self.bodies)
+            self.largest_of_bodies = Largest(device, real, [self.bodies])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
