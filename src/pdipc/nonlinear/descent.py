@@ -125,6 +125,7 @@ def limits(real: Real) -> Any:
         tolerance=real.scalar,  # m
         most_change=real.scalar,  # of a barrier's curvature, in parts of it
         max_outer=int,
+        most_idle=int,  # outer iterations in a row in which no potential falls by more than rounding
         budget_ms=wp.float64,
     )
 
@@ -154,6 +155,13 @@ def motion(real: Real) -> Any:
         center=wp.array(dtype=wp.vec3d),  # of each body, m
         turn=wp.array(dtype=wp.vec3d),  # rad
     )
+
+
+@func
+def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
+    """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
+    # a little more than the inertia, for bodies on a line
+    return wp.inverse(wp.float64(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wp.float64) - outer) * momentum
 
 
 @functools.cache
@@ -406,8 +414,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             left = wide(0.0)
             if total > wide(0.0) and square > wide(0.0):
-                # a little more than the inertia, for bodies on a line
-                turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * torque
+                turn = turned(square, outer, torque)
                 left = wide(h) * wide(h) * (wp.length(force) / total + wp.sqrt(square / total) * wp.length(turn))
             left_out[b] = scalar(left)
 
@@ -486,8 +493,10 @@ def kernels(real: Real) -> SimpleNamespace:
             progress.count[status.IDLE] = progress.count[status.IDLE] + 1
             if search.lowered[0] != 0 or progress.count[status.MOVING] != 0 or script[ARRIVED] != 0:
                 progress.count[status.IDLE] = 0
+            most_rounded = scalar(ROUNDED) * limits.tolerance
             if search.project[0] != 0:
                 left = left / scalar(EXACT)
+                most_rounded = scalar(EXACT) * most_rounded
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = (
                 left <= limits.tolerance
@@ -496,7 +505,11 @@ def kernels(real: Real) -> SimpleNamespace:
             )
             if search.attempts[0] > 1 and search.lowered[0] == 0 and residual <= scalar(EXACT) * limits.tolerance:
                 done = True
-            if progress.count[status.IDLE] >= IDLE and left <= scalar(ROUNDED) * limits.tolerance:
+            # and where nothing falls for long, motions are rounding's: their ratios say nothing
+            if (
+                progress.count[status.IDLE] >= limits.most_idle
+                and wp.max(residual, progress.numbers[status.UNBALANCED]) <= most_rounded
+            ):
                 done = True
             settled = done and search.hits[0] == 0 and progress.count[status.MOVING] == 0 and search.restrained[0] == 0
             if residual >= scalar(wp.inf):
@@ -505,7 +518,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 code = status.CONVERGED
             elif settled and script[WILL] == 0:
                 code = status.LAGGING
-            elif progress.count[status.STALLED] >= STALLS or progress.count[status.IDLE] >= IDLE:
+            elif progress.count[status.STALLED] >= STALLS or progress.count[status.IDLE] >= limits.most_idle:
                 code = status.STALLING
             elif (
                 limits.budget_ms > wide(0.0) and progress.clock[status.LAST] - progress.clock[status.STARTED] > limits.budget_ms
@@ -656,6 +669,8 @@ class Descent:
         self.limits = limits(real)()
         self.limits.tolerance, self.limits.max_outer = settings.tolerance, settings.max_outer
         self.limits.most_change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
+        # what need not lower the potential does not idle where it does not
+        self.limits.most_idle = IDLE if descends else settings.max_outer
         self.limits.budget_ms = settings.budget_ms or 0.0
         self.motion = motion(real)()
         self.motion.base, self.motion.u, self.motion.u_tilde = work.x_start, work.u, work.u_tilde
@@ -666,8 +681,9 @@ class Descent:
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
         self.weighs = weighs and any(whole)
         self.balanced = self._bodies(whole)
-        self.unbalanced = zeros(scalar, self.bodies)
-        self.largest_of_bodies = Largest(device, real, [max(1, self.bodies)])
+        if self.weighs:
+            self.unbalanced = zeros(scalar, self.bodies)
+            self.largest_of_bodies = Largest(device, real, [self.bodies])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
