@@ -57,7 +57,7 @@ def _inside(node: ast.AST, name: str, text: list[str]) -> Iterator[Function]:
                 _lines(child) - sum(map(_lines, outermost)),
                 len(taken) - (taken[:1] == ["self"]),
                 # decorators that make kernels, and functions whose code is generated
-                any(each.startswith(("wp.kernel", "kernel(", "language.func_native")) for each in decorators),
+                any(each.startswith(("wp.kernel", "kernel(", "language.func_native", "wp.func_native")) for each in decorators),
                 any(each in ("func", "wp.func") for each in decorators),
                 "\n".join(text[above + 1 : begins - 1]),
             )

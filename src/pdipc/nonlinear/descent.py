@@ -91,13 +91,6 @@ def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
     return result
 
 
-@func
-def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
-    """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
-    # a little more than the inertia, for bodies on a line
-    return wp.inverse(wp.float64(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wp.float64) - outer) * momentum
-
-
 @struct
 class Energies:
     """The potential of each body, J: at x and where it is tried, without friction and that alone; and of its island."""
@@ -134,7 +127,7 @@ def limits(real: Real) -> Any:
         tolerance=real.scalar,  # m
         most_change=real.scalar,  # of a barrier's curvature, in parts of it
         max_outer=int,
-        most_idle=int,  # outer iterations
+        most_idle=int,  # outer iterations in a row in which no potential falls by more than rounding
         budget_ms=wp.float64,
     )
 
@@ -164,6 +157,13 @@ def motion(real: Real) -> Any:
         center=wp.array(dtype=wp.vec3d),  # of each body, m
         turn=wp.array(dtype=wp.vec3d),  # rad
     )
+
+
+@func
+def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
+    """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
+    # a little more than the inertia, for bodies on a line
+    return wp.inverse(wp.float64(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wp.float64) - outer) * momentum
 
 
 @functools.cache
@@ -719,10 +719,9 @@ class Descent:
         self.energies, self.search = filled(Energies, self), filled(Search, self)
         self.limits = limits(real)()
         self.limits.tolerance, self.limits.max_outer = settings.tolerance, settings.max_outer
-        self.limits.most_idle = (
-            IDLE if descends else settings.max_outer
-        )  # what need not lower the potential does not idle where it does not
         self.limits.most_change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
+        # what need not lower the potential does not idle where it does not
+        self.limits.most_idle = IDLE if descends else settings.max_outer
         self.limits.budget_ms = settings.budget_ms or 0.0
         self.motion = motion(real)()
         self.motion.base, self.motion.u, self.motion.u_tilde = work.x_start, work.u, work.u_tilde

@@ -4,12 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
+from physics.scenes import cloth, floor, scene, watched
 
 import pdipc
 from pdipc.integration import status
 from pdipc.integration.script import PATIENCE
 from pdipc.scene.check import check
-from physics.scenes import cloth, floor, scene, watched
 
 
 def test_closing_boards_arrive():
