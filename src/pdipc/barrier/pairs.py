@@ -23,7 +23,7 @@ import warp as wp
 
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
-from pdipc.collision.candidates import SILENT, Candidates
+from pdipc.collision.candidates import SILENT, Candidates, grouped
 from pdipc.collision.candidates import listed as candidates_of
 from pdipc.device import blocks
 from pdipc.device.language import Function, filled, func, kernel, struct_of
@@ -55,6 +55,18 @@ def frozen(real: Real) -> Any:
     )
 
 
+@functools.cache
+def brought(real: Real) -> Any:
+    """A struct: what vertices bring to their pairs; see `FrozenPairs`."""
+    return struct_of(
+        "Brought",
+        __name__,
+        kappa=wp.array(dtype=real.scalar),
+        friction=wp.array(dtype=real.scalar),
+        free=wp.array(dtype=real.scalar),
+    )
+
+
 @func
 def pair_stiffness(a: Scalar, b: Scalar, mollifier: Scalar):
     """N/m, of a pair whose sides bring a and b: their mean, since a pair is as stiff as its bodies are heavy; kinematic vertices, which bring 0,
@@ -78,7 +90,7 @@ def counts_here(q: wp.vec4i, s: int, free: wp.array(dtype=Scalar)) -> bool:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    Frozen, Listed = frozen(real), candidates_of(real)
+    Frozen, Brought, Listed, Grouped = frozen(real), brought(real), candidates_of(real), grouped(real)
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     far = wp.constant(real.scalar(1.0e30))
@@ -214,11 +226,8 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         points: Listed,
         lines: Listed,
-        size: int,
+        o: Grouped,
         capacity: int,
-        smallest: wp.array(dtype=scalar),
-        arrived: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
         count_out: wp.array(dtype=wp.int32),
         closest_out: wp.array(dtype=scalar),
         overflow: wp.array(dtype=wp.int32),
@@ -229,38 +238,38 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         group = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        before_lines = (points.count[0] + size - 1) // size
-        groups = wp.max(before_lines + (lines.count[0] + size - 1) // size, 1)
+        before_lines = (points.count[0] + o.size - 1) // o.size
+        groups = wp.max(before_lines + (lines.count[0] + o.size - 1) // o.size, 1)
         if group >= groups:
             return
         edges = group >= before_lines
         c = of_kind(edges, points, lines)
-        begin = group * size
+        begin = group * o.size
         if edges:
-            begin = (group - before_lines) * size
+            begin = (group - before_lines) * o.size
         active = int(0)
         closest = far
-        for k in range(begin + lane, wp.min(begin + size, c.count[0]), wp.block_dim()):
+        for k in range(begin + lane, wp.min(begin + o.size, c.count[0]), wp.block_dim()):
             closest = wp.min(closest, c.gaps[k])
             if acts(edges, k, c):
                 active += 1
         active = block_total(active)
         closest = block_least(closest)
         if lane == 0:
-            ends[group] = active
-            smallest[group] = closest
-        if last_block(arrived, 0, groups):
+            o.ends[group] = active
+            o.smallest[group] = closest
+        if last_block(o.arrived, 0, groups):
             found = int(0)
             closest = far
             for start in range(0, groups, wp.block_dim()):
                 g = start + lane
                 own = int(0)
                 if g < groups:
-                    own = ends[g]
-                    closest = wp.min(closest, smallest[g])
+                    own = o.ends[g]
+                    closest = wp.min(closest, o.smallest[g])
                 end = found + block_scan(own)
                 if g < groups:
-                    ends[g] = end
+                    o.ends[g] = end
                 found += block_total(own)
             closest = block_least(closest)
             if lane == 0:
@@ -268,7 +277,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 count_out[1] = wp.max(count_out[1], found)
                 count_out[2] = 0
                 if before_lines > 0:
-                    count_out[2] = ends[before_lines - 1]
+                    count_out[2] = o.ends[before_lines - 1]
                 closest_out[0] = closest
                 if found > capacity:
                     overflow[0] = 1
@@ -278,12 +287,9 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         points: Listed,
         lines: Listed,
-        size: int,
-        ends: wp.array(dtype=wp.int32),
+        o: Grouped,
         x: wp.array(dtype=vec3),
-        kappa: wp.array(dtype=scalar),
-        friction: wp.array(dtype=scalar),
-        free: wp.array(dtype=scalar),
+        brought: Brought,
         degree: wp.array(dtype=wp.int32),
         pairs_out: Frozen,
         share_out: wp.array(dtype=scalar),
@@ -292,20 +298,20 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         group = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        before_lines = (points.count[0] + size - 1) // size
-        if group >= before_lines + (lines.count[0] + size - 1) // size:
+        before_lines = (points.count[0] + o.size - 1) // o.size
+        if group >= before_lines + (lines.count[0] + o.size - 1) // o.size:
             return
         slot = int(0)
         if group > 0:
-            slot = ends[group - 1]
-        if ends[group] == slot:
+            slot = o.ends[group - 1]
+        if o.ends[group] == slot:
             return
         edges = group >= before_lines
         c = of_kind(edges, points, lines)
-        begin = group * size
+        begin = group * o.size
         if edges:
-            begin = (group - before_lines) * size
-        end = wp.min(begin + size, c.count[0])
+            begin = (group - before_lines) * o.size
+        end = wp.min(begin + o.size, c.count[0])
         for start in range(begin, end, wp.block_dim()):
             k = start + lane
             active = int(0)
@@ -330,10 +336,10 @@ def kernels(real: Real) -> SimpleNamespace:
                 pairs_out.normals[own] = wp.normalize(a[1] * p1 + a[2] * p2 + a[3] * p3)
                 pairs_out.gaps[own] = c.gaps[k]
                 pairs_out.activation[own] = c.limits[k][1]
-                pairs_out.stiffness[own] = pair_stiffness(kappa[q[0]], kappa[q[3]], m)
-                pairs_out.coefficient[own] = wp.sqrt(friction[q[0]] * friction[q[3]])
-                share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
-                share_out[own] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
+                pairs_out.stiffness[own] = pair_stiffness(brought.kappa[q[0]], brought.kappa[q[3]], m)
+                pairs_out.coefficient[own] = wp.sqrt(brought.friction[q[0]] * brought.friction[q[3]])
+                share = brought.free[q[0]] * wp.abs(a[0]) + brought.free[q[1]] * wp.abs(a[1])
+                share_out[own] = share + brought.free[q[2]] * wp.abs(a[2]) + brought.free[q[3]] * wp.abs(a[3])
                 if degree:
                     for s in range(4):
                         wp.atomic_add(degree, q[s], 1)
@@ -553,6 +559,8 @@ class FrozenPairs:
         n = len(kappa)
         self.device, self.real, self.kernels = device, real, kernels(real)
         self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
+        self.brought = brought(real)()
+        self.brought.kappa, self.brought.friction, self.brought.free = kappa, friction, free
         self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; most found; of these vertex-triangle
         self.closest = wp.zeros(1, dtype=real.scalar, device=device.warp)  # smallest gap, m
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
@@ -592,11 +600,10 @@ class FrozenPairs:
         k, device, groups = self.kernels, self.device, candidates.groups
         pairs = [each.listed for each in candidates.lists]
         device.launch_list(k.measure, candidates.capacity, [*pairs, x, ahead, driven])
-        found = [groups.ends, self.count, self.closest, candidates.overflow]
-        inputs = [*pairs, groups.size, self.capacity, groups.smallest, groups.arrived, *found]
+        inputs = [*pairs, groups.grouped, self.capacity, self.count, self.closest, candidates.overflow]
         device.launch_blocks(k.count_active, groups.number, inputs, grain=groups.size)
-        surfaces = [self.kappa, self.friction_of_vertex, self.free, self.degree if device.wide else None]
-        inputs = [*pairs, groups.size, groups.ends, x, *surfaces, self.frozen, self.share]
+        degree = self.degree if device.wide else None
+        inputs = [*pairs, groups.grouped, x, self.brought, degree, self.frozen, self.share]
         device.launch_blocks(k.freeze, groups.number, inputs, grain=groups.size)
         # each vertex's pairs, in order
         if not device.wide:

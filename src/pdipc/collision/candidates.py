@@ -31,7 +31,7 @@ from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
 from pdipc.device import blocks
 from pdipc.device.language import filled, func, kernel, struct_of
-from pdipc.device.launch import BLOCK, CPU_BLOCK, REDUCE_BLOCK, Device, Parts, Share, Span
+from pdipc.device.launch import BLOCK, CPU_BLOCK, Device, Parts, Share, Span
 from pdipc.device.precision import Real, Scalar
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
@@ -82,8 +82,38 @@ def listed(real: Real) -> Any:
 
 
 @functools.cache
+def grouped(real: Real) -> Any:
+    """A struct: `Groups` as kernels take them."""
+    return struct_of(
+        "Grouped",
+        __name__,
+        size=int,
+        ends=wp.array(dtype=wp.int32),
+        smallest=wp.array(dtype=real.scalar),  # m
+        arrived=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
+def reuse(real: Real) -> Any:
+    """A struct: the motion that candidates were listed for, and whether they hold for another; see `Candidates`."""
+    return struct_of(
+        "Reuse",
+        __name__,
+        begin=wp.array(dtype=real.vec3),
+        end=wp.array(dtype=real.vec3),
+        margin=real.scalar,
+        overflow=wp.array(dtype=wp.int32),
+        away=wp.array(dtype=wp.int32),  # (4,) whether any vertex begins away from `begin`, or from `end`, or ends so
+        needed=wp.array(dtype=wp.int32),
+        renewed=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, Vertices = real.scalar, real.vec2, real.vec3, vertices(real)
+    Reuse = reuse(real)
     module = real.module(__name__)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
     nothing = wp.constant(scalar(IGNORED))
@@ -168,43 +198,30 @@ def kernels(real: Real) -> SimpleNamespace:
         return wp.length(distance.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
 
     @kernel(module)
-    def check(
-        first: int,
-        x0: wp.array(dtype=vec3),
-        x1: wp.array(dtype=vec3),
-        begin: wp.array(dtype=vec3),
-        end: wp.array(dtype=vec3),
-        margin: scalar,
-        parts: Share,
-        overflow: wp.array(dtype=wp.int32),
-        away: wp.array(dtype=wp.int32),
-        needed_out: wp.array(dtype=wp.int32),
-        renewed_out: wp.array(dtype=wp.int32),
-    ):
-        """away[0] and [1]: whether any x0 is more than the margin away from `begin`, and from `end`; away[2] and [3]: any x1. Cleared for the
-        next time by who decides."""
+    def check(first: int, x0: wp.array(dtype=vec3), x1: wp.array(dtype=vec3), parts: Share, o: Reuse):
+        """Who is away, by blocks of threads; the last decides, and clears that for the next time."""
         worker = first + wp.tid()
         block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
         for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, x0.shape[0]), wp.block_dim()):
             # whoever writes, writes the same
-            if not near(x0[i], begin[i], margin):
-                away[0] = 1
-            if not near(x0[i], end[i], margin):
-                away[1] = 1
-            if not near(x1[i], begin[i], margin):
-                away[2] = 1
-            if not near(x1[i], end[i], margin):
-                away[3] = 1
+            if not near(x0[i], o.begin[i], o.margin):
+                o.away[0] = 1
+            if not near(x0[i], o.end[i], o.margin):
+                o.away[1] = 1
+            if not near(x1[i], o.begin[i], o.margin):
+                o.away[2] = 1
+            if not near(x1[i], o.end[i], o.margin):
+                o.away[3] = 1
         if last_block(parts.arrived, 0, parts.number):  # noqa: SIM102  (all threads of a block ask)
             if lane == 0:
-                needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
-                if overflow[0] != 0:
-                    needed_out[0] = 0  # what was found stays known, until there is room for it
-                if needed_out[0] != 0:
-                    renewed_out[0] = 1
+                o.needed[0] = wp.max(wp.min(o.away[0], o.away[1]), wp.min(o.away[2], o.away[3]))
+                if o.overflow[0] != 0:
+                    o.needed[0] = 0  # what was found stays known, until there is room for it
+                if o.needed[0] != 0:
+                    o.renewed[0] = 1
                 for k in range(4):
-                    away[k] = 0
+                    o.away[k] = 0
 
     @kernel(module)
     def keep(
@@ -254,7 +271,7 @@ class CandidateList:
 
 class Groups:
     """Candidates that are counted together, `size` of one kind: number, of both kinds in lists of these capacities, of which each may end in a part of a
-    group. ends, smallest: a number for each; arrived: the counter of `blocks.last`.
+    group. ends, smallest: a number for each; arrived: the counter of `blocks.last`. grouped: these as kernels take them.
     """
 
     def __init__(self, device: Device, real: Real, capacities: list[int]):
@@ -263,6 +280,7 @@ class Groups:
         self.ends = wp.zeros(self.number, dtype=wp.int32, device=device.warp)
         self.smallest = wp.zeros(self.number, dtype=real.scalar, device=device.warp)
         self.arrived = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.grouped = filled(grouped(real), self)
 
 
 class Candidates:
@@ -308,6 +326,7 @@ class Candidates:
         self.sieve = sieve.functions(real).Sieve()
         self.sieve.begin, self.sieve.end, self.sieve.reach = self.begin, self.end, self.reach
         self.overflow = broad_phase.overflow
+        self._reuse = filled(reuse(real), self)
         self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
         self.vertex_triangle, self.edge_edge = self.lists
         self.generation = 0
@@ -372,6 +391,4 @@ class Candidates:
         It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
         """
         parts = self._parts
-        inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), parts.share, self.overflow]
-        inputs += [self.away, self.needed, self.renewed]
-        self.device.launch_blocks(self.kernels.check, parts.number, inputs, grain=REDUCE_BLOCK)
+        self.device.launch_blocks(self.kernels.check, parts.number, [x0, x1, parts.share, self._reuse], grain=parts.size)

@@ -8,8 +8,22 @@ import numpy as np
 import warp as wp
 
 from pdipc.device import blocks
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct
 from pdipc.device.launch import BLOCK, Device
+
+
+@struct
+class Blocks:
+    """The blocks of `BodySums`: where each starts and ends in its array, `own` of them in the first one, and whose it is; and the blocks of each body."""
+
+    starts: wp.array[wp.int32]
+    ends: wp.array[wp.int32]
+    own: int
+    body_of: wp.array[wp.int32]
+    offsets: wp.array[wp.int32]  # of each body, into
+    listed: wp.array[wp.int32]
+    partial: wp.array[wp.float64]  # sums
+    arrived: wp.array[wp.int32]  # of each body, see `blocks.last`
 
 
 @functools.cache
@@ -21,16 +35,9 @@ def kernels() -> SimpleNamespace:
     @kernel(module)
     def add(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        body_of: wp.array(dtype=wp.int32),
+        o: Blocks,
         values: wp.array(dtype=wp.float64),
         more: wp.array(dtype=wp.float64),
-        own: int,
-        offsets: wp.array(dtype=wp.int32),
-        listed: wp.array(dtype=wp.int32),
-        partial: wp.array(dtype=wp.float64),
-        arrived: wp.array(dtype=wp.int32),
         total_out: wp.array(dtype=wp.float64),
     ):
         """The first `own` blocks are of `values`, the others of `more`; the last of a body to be done adds up the body's."""
@@ -38,19 +45,19 @@ def kernels() -> SimpleNamespace:
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
         total = wp.float64(0.0)
-        for i in range(starts[b] + lane, ends[b], wp.block_dim()):
-            if b < own:
+        for i in range(o.starts[b] + lane, o.ends[b], wp.block_dim()):
+            if b < o.own:
                 total += values[i]
             else:
                 total += more[i]
         total = block_total(total)
         if lane == 0:
-            partial[b] = total
-        body = body_of[b]
-        if last_block(arrived, body, offsets[body + 1] - offsets[body]):
+            o.partial[b] = total
+        body = o.body_of[b]
+        if last_block(o.arrived, body, o.offsets[body + 1] - o.offsets[body]):
             total = wp.float64(0.0)
-            for k in range(offsets[body] + lane, offsets[body + 1], wp.block_dim()):
-                total += partial[listed[k]]
+            for k in range(o.offsets[body] + lane, o.offsets[body + 1], wp.block_dim()):
+                total += o.partial[o.listed[k]]
             total = block_total(total)
             if lane == 0:
                 total_out[body] = total
@@ -62,7 +69,7 @@ class BodySums:
     """Adds up one or two arrays whose entries belong to bodies. owners: for each array the body of every entry, -1 for none; bodies: how many."""
 
     def __init__(self, device: Device, owners: list[np.ndarray], bodies: int):
-        self.device, self.bodies, self._kernels = device, bodies, kernels()
+        self.device, self._kernels = device, kernels()
         cuts, bodies_of_blocks, at = [], [], 0
         for owner in owners:
             owner = np.asarray(owner)
@@ -76,14 +83,15 @@ class BodySums:
             bodies_of_blocks.append(owner[starts] if len(starts) else np.zeros(0, dtype=np.int64))
             cuts.append((starts, ends))
             at += len(starts)
-        self._own, self._count = len(cuts[0][0]), at
-        self._starts, self._ends = (self._upload(np.concatenate(each)) for each in zip(*cuts, strict=True))
+        self._count = at
         body = np.concatenate([*bodies_of_blocks, np.zeros(0, dtype=np.int64)])
         order = np.argsort(body, kind="stable")
-        self._offsets = wp.array(np.searchsorted(body[order], np.arange(bodies + 1)).astype(np.int32), device=device.warp)
-        self._blocks, self._body_of = self._upload(order), self._upload(body)
-        self._arrived = wp.zeros(max(1, bodies), dtype=wp.int32, device=device.warp)
-        self._partial = wp.zeros(max(1, at), dtype=wp.float64, device=device.warp)
+        o = self._blocks = Blocks()
+        o.starts, o.ends = (self._upload(np.concatenate(each)) for each in zip(*cuts, strict=True))
+        o.own, o.body_of, o.listed = len(cuts[0][0]), self._upload(body), self._upload(order)
+        o.offsets = wp.array(np.searchsorted(body[order], np.arange(bodies + 1)).astype(np.int32), device=device.warp)
+        o.partial = wp.zeros(max(1, at), dtype=wp.float64, device=device.warp)
+        o.arrived = wp.zeros(max(1, bodies), dtype=wp.int32, device=device.warp)
 
     def _upload(self, values: np.ndarray) -> wp.array:
         return wp.array(np.append(values, 0).astype(np.int32), dtype=wp.int32, device=self.device.warp)
@@ -91,6 +99,5 @@ class BodySums:
     def add(self, arrays: list[wp.array], total_out: wp.array) -> None:
         """Launches total_out[b] = sum of the entries of body b over all arrays; of a body without entries it stays as it is."""
         if self._count:
-            inputs = [self._starts, self._ends, self._body_of, arrays[0], arrays[-1], self._own]
-            inputs += [self._offsets, self._blocks, self._partial, self._arrived, total_out]
+            inputs = [self._blocks, arrays[0], arrays[-1], total_out]
             self.device.launch_blocks(self._kernels.add, self._count, inputs, grain=BLOCK // 4)

@@ -502,6 +502,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 anew = int(0)
         renew[0] = anew
 
+    # Long: one decision, of all that was found out in an iteration.
     @func
     def conclude(
         pairs: wp.array(dtype=wp.int32),
@@ -586,6 +587,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if code == status.RUNNING:
             progress.going[0] = 1
 
+    # Arguments: all that an iteration hands on to the next, in one launch.
     @kernel(module)
     def decide(
         first: int,
