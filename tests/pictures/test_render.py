@@ -123,6 +123,17 @@ def test_bodies_have_the_looks_that_they_are_given(run):
     assert clear[0, 0, 3] == 0 and clear[50, 80, 3] == 255
 
 
+def test_glass_covers_a_transparent_background_in_part(run):
+    """Over any colour the picture is what it would be with that colour behind it, also at the edges of bodies."""
+    run.scene["bodies"][1]["look"] = {"opacity": 0.4}
+    look = {"shadows": False, "ground": "none"}
+    clear, grey = drawn(run, background="transparent", **look).astype(float), drawn(run, background="#808080", **look)
+    part = clear[..., 3:] / 255.0
+    assert {0.0, 0.4, 1.0} <= set(np.unique(part.round(2)))
+    over = part * clear[..., :3] + (1.0 - part) * 128.0
+    assert np.abs(over - grey).max() < 4.0
+
+
 def test_obstacles_that_hide_bodies_let_them_be_seen(tmp_path):
     run = box(tmp_path / "run")
     assert not share(drawn(run, obstacles="solid"), BLUE).any()

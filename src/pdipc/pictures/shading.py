@@ -73,7 +73,7 @@ def compose(
     radius: float,
     oversampled: int,
 ) -> np.ndarray:
-    """(h, w, 4) uint8: the picture, its rows from below; the last channel is how much of a pixel is covered, of 255.
+    """(h, w, 3) uint8: the picture, its rows from below.
 
     oversampled: f, drawn pixels per pixel along each side. everywhere, lamp: (f h, f w, 3) uint8, the two parts of the light. depth:
     (f h, f w) float32, 1 where nothing is. seen_by_lamp:
@@ -81,7 +81,7 @@ def compose(
     radius: m, of what shades by its nearness; 0 for no such shade.
     """
     height, width = (side // oversampled for side in depth.shape)
-    out = wp.zeros((height * width, 4), dtype=wp.uint8, device="cpu")
+    out = wp.zeros((height * width, 3), dtype=wp.uint8, device="cpu")
     view, light = _View(), _Lamp()
     view.depth = _array(depth, wp.float32)
     view.near, view.far = camera.near, camera.far
@@ -100,7 +100,7 @@ def compose(
         device.launch(kernels().shade, coarse.size, [step, view, coarse], grain=100)
     inputs = [oversampled, width, _array(everywhere, wp.uint8), _array(lamp, wp.uint8), view, light, coarse, out]
     device.launch(kernels().compose, height * width, inputs, grain=100)
-    return out.numpy().reshape(height, width, 4)
+    return out.numpy().reshape(height, width, 3)
 
 
 def _array(values: np.ndarray, dtype: type) -> Any:
@@ -307,6 +307,5 @@ def kernels() -> SimpleNamespace:
         share = 1.0 / float(factor * factor)
         for c in range(3):
             out[i, c] = wp.uint8(color[c] * share + 0.5)
-        out[i, 3] = wp.uint8(255.0 * cover * share + 0.5)
 
     return SimpleNamespace(shade=shade, compose=compose)
