@@ -172,6 +172,9 @@ def tunic() -> pdipc.Scene:
     ]
     for body, color in zip(bodies, ("#c8508a", "#8a50c8"), strict=True):
         body["look"] = {"color": color}
+        body["pins"] = [
+            {"select": {"box": [[-1, 0.5 * tall - 0.01, -1], [1, 1, 1]]}, "axes": "y", "stiffness": 50.0, "end": 0.45}
+        ]
     x, y = 0.5 * wide, 0.5 * tall
     places = [[[-x - 0.01, -1, -1], [-x + 0.01, y - armhole, 1]], [[x - 0.01, -1, -1], [x + 0.01, y - armhole, 1]]]
     places += [[[-1, y - 0.01, -1], [-neck, y + 0.01, 1]], [[neck, y - 0.01, -1], [1, y + 0.01, 1]]]
