@@ -347,8 +347,8 @@ class Placed(Table):
 
     name: str = Field(min_length=1, max_length=200, description="Name, unique in the scene.")
     mesh: MeshSource = Field(
-        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp; of USD also one prim, "
-        "`shot.usda</World/Flag>`), a shape, or arrays."
+        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp; of USD and Alembic also "
+        "a part, `shot.usda</World/Flag>`), a shape, or arrays."
     )
     scale: Positive | tuple[Positive, Positive, Positive] = Field(
         default=1.0, description="Factor on the mesh's coordinates; along x, y, z if three."
@@ -838,7 +838,7 @@ class Deformation(Table):
             custom_error_message="must be a file, a pattern of files, or a table with vertices and times",
         ),
     ] = Field(
-        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD), a pattern of files that are a frame each, "
+        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD, Alembic), a pattern of files that are a frame each, "
         "such as `body_*.obj`, or arrays; of as many vertices as the mesh has."
     )
     frame_rate: Positive | None = Field(
