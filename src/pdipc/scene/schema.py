@@ -73,7 +73,8 @@ class Simulation(Table):
         description="Mass-proportional damping, 1/s: the part of its velocity that a free body loses per second.",
     )
     precision: Literal["auto", "float32", "float64"] = Field(
-        default="auto", description='Working precision; "auto" takes what measured faster on the device.'
+        default="auto",
+        description='Working precision; "auto": float64 on CPUs; on CUDA float32, unless a solid is too stiff for it.',
     )
     device: str | None = Field(default=None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
     tolerance: Positive | None = Field(
@@ -92,11 +93,12 @@ class Simulation(Table):
         description='How the nonlinear problem of a step is solved; "auto" is newton, unless a setting of local-global '
         "(inner_iterations, linear_solver, linear_iterations, linear_tolerance, solver_order, solver_drop) is given.",
     )
-    max_outer: Whole = Field(
-        default=100,
+    max_outer: Whole | None = Field(
+        default=None,
         ge=1,
         le=10**6,
-        description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
+        description="Most outer iterations of a step; a step that ends here is feasible, and says so. Absent: 1000 by Newton's method, "
+        "whose hardest impacts take hundreds, else 100.",
     )
     inner_iterations: Whole = Field(
         default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration."
