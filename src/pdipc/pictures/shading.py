@@ -188,8 +188,17 @@ def kernels() -> SimpleNamespace:
                 if reached(lamp, i, j, at, steep) == 0.0:
                     blockers += 1.0
                     depths += lamp.seen[j, i]
+        if blockers == 0.0:  # what is thinner than samples are apart may yet be in the way
+            i0 = int(wp.floor(at[0] * float(lamp.seen.shape[1]) - 0.5))
+            j0 = int(wp.floor(at[1] * float(lamp.seen.shape[0]) - 0.5))
+            for k in range(4):
+                i, j = i0 + k % 2, j0 + k // 2
+                if i >= 0 and j >= 0 and i < lamp.seen.shape[1] and j < lamp.seen.shape[0]:  # noqa: SIM102 (Warp looks at both)
+                    if reached(lamp, i, j, at, steep) == 0.0:
+                        blockers += 1.0
+                        depths += lamp.seen[j, i]
         if blockers == 0.0:
-            return lit(lamp, at[0], at[1], at, steep)
+            return 1.0
         wide = LAMP_SIZE * (at[2] - depths / blockers) * deep
         wide = wp.max(wide, 1.5 * across[0] / float(lamp.seen.shape[1]))
         total = float(0.0)
