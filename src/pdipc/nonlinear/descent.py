@@ -451,6 +451,7 @@ def kernels(real: Real) -> SimpleNamespace:
         attempts_out[0] = 0
         count_out[status.MOVING] = 0
 
+    # Long: one decision, of all that was found out in an iteration.
     @kernel(module)
     def decide(
         first: int,
