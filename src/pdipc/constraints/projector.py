@@ -26,6 +26,7 @@ from pdipc.constraints import (
     triangle_area,
     triangle_strain,
     woven,
+    woven_bending,
 )
 from pdipc.constraints.base import ConstraintSet, merge
 from pdipc.device.language import kernel
@@ -46,6 +47,7 @@ KINDS = (
     strain_limit,
     edge_length,
     quadratic_bending,
+    woven_bending,
     curved_bending,
     enclosed_volume,
     stitch,
