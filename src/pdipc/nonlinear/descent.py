@@ -227,6 +227,7 @@ def kernels(real: Real) -> SimpleNamespace:
         accepted: wp.array(dtype=wp.int32),
         attempts: wp.array(dtype=wp.int32),
         least: wp.array(dtype=scalar),
+        free: wp.array(dtype=scalar),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
@@ -253,6 +254,8 @@ def kernels(real: Real) -> SimpleNamespace:
             fraction[i] = f
             arm = widened(base[i] + u[i]) - center[b]
             arc = vec3(curved(arm, wide(f) * turn[b])) - f * vec3(curved(arm, turn[b]))
+            if free[i] == scalar(0.0):
+                arc = vec3()
             u_end_out[i] = u[i] + f * (u_tilde[i] - u[i]) + arc
             x_end_out[i] = base[i] + u_end_out[i]
 
@@ -733,7 +736,7 @@ class Descent:
                 inputs = [self.starts, self.ends, model.free, self.attempts, t.first_fraction, t.fraction, self.least]
                 device.launch_blocks(k.least_fraction, self.bodies, inputs, grain=1000)
                 device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
-            which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
+            which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least, model.free]
             motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
             device.launch(k.turn_back, n, [*which, *motion])
             w.candidates.check(w.x, t.x_end)

@@ -8,8 +8,8 @@ as `descent` has it, over the displacements u since the start of the step. Its H
 conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free nonlinear programming ... could fit in Alg. 1").
 
 The step is straight, and a straight step that rotates a body stretches it, by the square of the angle: for a body of steel more than a few
-microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So where no vertex of a
-body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
+microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So the part of the step
+that rotates the body as a whole, about what holds it if something does, becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
 p by its square, so it descends as p does, and solves as fast as p where that is small. A step that would rotate by more than a radian is made in part.
 
 Where the Hessian is indefinite the projected one takes its place, whose bound makes steps creep along directions that the potential curves down in; as
@@ -34,7 +34,7 @@ from pdipc.barrier import exact, friction
 from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device import blocks
-from pdipc.device.language import func, kernel
+from pdipc.device.language import kernel
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -44,7 +44,10 @@ from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
 from pdipc.nonlinear.descent import Descent, curved, turned, widened
 
-SAMPLES = 128  # vertices of a body that tell how it rotates
+SAMPLES, GRIP = (
+    128,
+    1.0e6,
+)  # vertices of a body that tell how it rotates; and how much more than all of them those weigh that are held
 MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
@@ -55,13 +58,6 @@ REBOUND_TOLERANCE = {
     "float32": 1.0e-5,
     "float64": 1.0e-9,
 }  # of the one solve for restitution: what is left of it acts as from outside
-
-
-@func
-def sampled(k: int, number: int, count: int) -> int:
-    """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
-    # In Warp's language the quotient of integers is one.
-    return (k * count) / number + (k * 37) % (count / number)
 
 
 @functools.cache
@@ -166,9 +162,8 @@ def kernels(real: Real) -> SimpleNamespace:
     def find_turn(
         first: int,
         starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        whole: wp.array(dtype=wp.int32),
-        mass: wp.array(dtype=scalar),
+        samples: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=wide),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -177,23 +172,20 @@ def kernels(real: Real) -> SimpleNamespace:
         turn_out: wp.array(dtype=wp.vec3d),
         part_out: wp.array(dtype=scalar),
     ):
-        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held.
+        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point, as its samples tell.
         A part of the step is made where all of it would rotate by more than MOST_TURN."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
         start = starts[b]
-        count = ends[b] - start
-        number = wp.min(count, SAMPLES)
-        if whole[b] == 0:
-            number = 0
-        origin = base[start]
+        end = starts[b + 1]
+        origin = base[samples[start]]
         total = wide(0.0)
         center = wp.vec3d()
         mean = wp.vec3d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = samples[k]
+            m = weights[k]
             total += m
             center += m * widened((base[i] - origin) + u[i])
             mean += m * widened(p[i])
@@ -206,9 +198,9 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = wp.vec3d()
         square = wide(0.0)
         outer = wp.mat33d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = samples[k]
+            m = weights[k]
             arm = widened((base[i] - origin) + u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
@@ -216,17 +208,16 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = total_vector(momentum)
         square = total_number(square)
         outer = total_matrix(outer)
-        turn = wp.vec3d()
-        if number > 0:
-            turn = wide(stretch[0]) * turned(square, outer, momentum)
+        if lane == 0:
+            turn = wp.vec3d()
+            if square > wide(0.0):
+                turn = wide(stretch[0]) * turned(square, outer, momentum)
             if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
-        if lane == 0:
             part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
-            turn = part * turn
-            part_out[b] = scalar(part)
             center_out[b] = widened(origin) + center
-            turn_out[b] = turn
+            turn_out[b] = part * turn
+            part_out[b] = scalar(part)
 
     @kernel(module)
     def propose(
@@ -256,7 +247,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] > scalar(0.0):
             step = stretch[0] * step
         b = body[i]
-        if b >= 0 and moved < scalar(wp.inf):
+        if b >= 0 and free[i] > scalar(0.0) and moved < scalar(wp.inf):
             step = part[wp.max(b, 0)] * step
             step += vec3(curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
         u_tilde = u[i] + step
@@ -336,6 +327,26 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 
 
+def samples_of(vertices: np.ndarray, free: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a body that tell how it rotates as a whole, and their weights: masses, and for what is held far more than all of these,
+    so that a body turns about what holds it and not at all where that is more than an axis.
+
+    vertices: (k,); free: (n,) bool; mass: (n,) kg. Returns at most SAMPLES of each kind, (s,) int and (s,) kg.
+    """
+    loose, held = vertices[free[vertices]], vertices[~free[vertices]]
+    loose, held = (_spread(each, SAMPLES) for each in (loose, held))
+    grip = np.full(len(held), GRIP * mass[loose].sum() / max(1, len(held)))
+    return np.concatenate([loose, held]), np.concatenate([mass[loose], grip])
+
+
+def _spread(vertices: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of them: all where they are few, else spread, and not along the rows of a grid."""
+    if len(vertices) <= most:
+        return vertices
+    k, every = np.arange(most), len(vertices) // most
+    return vertices[k * len(vertices) // most + (37 * k) % every]
+
+
 class Newton(Descent):
     """The nonlinear solve of Algorithm 1 by projected Newton; see `nonlinear.Method` for the seam."""
 
@@ -344,7 +355,7 @@ class Newton(Descent):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count
         self.kernels = kernels(real)
-        free = model.free_vertices
+        free, mass = model.free_vertices, model.mass.numpy().astype(np.float64)
         self.matrix = BlockMatrix(device, real, model.projector, model.held, free)
         equations = (device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
         operators = (exact.operator(real), friction.operator(real))
@@ -356,8 +367,13 @@ class Newton(Descent):
         def zeros(dtype, count=n):
             return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
 
-        whole = [free[low:high].all() for low, high in self.ranges]
-        self.whole = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
+        found = [samples_of(np.arange(low, high), free, mass) for low, high in self.ranges]
+        starts = np.cumsum([0, *(len(samples) for samples, _ in found)])
+        samples, weights = (np.concatenate([*side, [0]]) for side in zip(*found, strict=True)) if found else ([0], [0.0])
+        self.turning = [
+            wp.array(np.asarray(values, dtype=kind), device=device.warp)
+            for values, kind in ((starts, np.int32), (samples, np.int32), (weights, np.float64))
+        ]
         vec3, scalar = real.vec3, real.scalar
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.forces, self.scales = (zeros(scalar) for _ in range(3))
@@ -429,7 +445,7 @@ class Newton(Descent):
         states = [self.project, self.hits, self.attempts, w.count]
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
         if self.bodies:
-            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p]
+            inputs = [*self.turning, w.x_start, w.u, self.p]
             inputs += [self.stretch, self.center, self.turn, self.part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn, self.part]
