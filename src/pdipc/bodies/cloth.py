@@ -24,7 +24,7 @@ from pdipc.scene.check_garments import WARP
 from pdipc.scene.schema import ClothMaterial
 
 
-def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+def elasticity(assembly: Assembly, body: AssembledBody, newton: bool) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
     """The constraints of a cloth, and the masses (n,) kg of its vertices among all."""
     x, m = assembly.rest_positions, body.material
     assert isinstance(m, ClothMaterial)
@@ -66,6 +66,12 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
         sets.append(enclosed_volume.rest(outward, cavity, np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (len(cavity), 1))))
     mass = material.lumped_mass(len(x), body.triangles, m.areal_density * triangles.rest_shape(rest, corners)[1])
     return sets, mass
+
+
+def speed_of_sound(m: ClothMaterial) -> float:
+    """m/s, along the sheet."""
+    assert m.membrane_stiffness is not None  # its validator has set it
+    return float(np.sqrt(m.membrane_stiffness / m.areal_density))
 
 
 def seams(assembly: Assembly) -> list[constraints.ConstraintSet]:

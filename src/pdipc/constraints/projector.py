@@ -126,7 +126,7 @@ class Projector:
                 self.threads = rest[1]
             if kind is enclosed_volume:
                 c = self.cavities = enclosed_volume.Cavities(device, real, n_vertices, s)
-                rest = [c.number, c.pressure, c.leader, c.first, c.energy]
+                rest = [c.held]
             arrays = [wp.array(s.vertices, dtype=vector, device=device.warp), *rest]
             arrays.append(wp.array(s.weight, dtype=real.scalar, device=device.warp))
             kernels = kind.kernels(real)
