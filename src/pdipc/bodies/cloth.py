@@ -17,6 +17,7 @@ from pdipc.constraints import (
     triangle_strain,
     triangles,
     woven,
+    woven_bending,
 )
 from pdipc.scene.assembly import AssembledBody, Assembly
 from pdipc.scene.check_garments import WARP
@@ -55,6 +56,9 @@ def elasticity(assembly: Assembly, body: AssembledBody, newton: bool) -> tuple[l
     if m.bending_stiffness:
         if m.bending == "curved":
             sets.append(curved_bending.rest(x, body.triangles, m.bending_stiffness))
+        elif m.weft_bending_stiffness:
+            stiffness = m.bending_stiffness, m.weft_bending_stiffness
+            sets.append(woven_bending.rest(x, body.triangles, *stiffness, m.warp or WARP, body.pattern))
         else:
             sets.append(quadratic_bending.rest(x, body.triangles, m.bending_stiffness, body.pattern))
     if body.inside is not None:

@@ -27,6 +27,7 @@ from pdipc.constraints import (
     triangle_area,
     triangle_strain,
     woven,
+    woven_bending,
 )
 from pdipc.constraints.base import ConstraintSet, merge
 from pdipc.device.language import func, kernel, struct_of
@@ -47,6 +48,7 @@ KINDS = (
     strain_limit,
     edge_length,
     quadratic_bending,
+    woven_bending,
     curved_bending,
     enclosed_volume,
     stitch,

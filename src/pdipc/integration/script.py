@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from pdipc.device.language import filled, kernel, struct_of
@@ -323,7 +322,6 @@ class Script:
         held, whole = (np.concatenate([np.zeros(0, dtype=bool), *parts]) for parts in (held, whole))
         self.to_points, self.on_rails = held & whole, held & ~whole
         self._ways: list[Way] = []
-        self._late = ""
         n, count = len(assembly.positions), max(1, len(self.movers))
 
         def zeros(dtype, size=count) -> wp.array:
@@ -507,17 +505,17 @@ class Script:
             self.corners[: len(corners)].assign(corners.astype(self.real.numpy))
 
     def settle(self, time: float, reached: Reached, lag: float, positions: wp.array) -> tuple[Reached, float, str]:
-        """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and
-        why.
+        """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and a
+        sentence that names it; nothing where all are in time.
 
         reached: where the step started. lag: m, how far the last is behind the goal of the step.
         """
-        now, why = reached.copy(), "where something is in its way"
+        now = reached.copy()
         now.times[:] = time
         if self.anchors is not None:
             now.anchors = self.anchors.copy()
         if not self.moves:
-            return now, lag, why
+            return now, *self._last(time, now, lag, positions)
         arrived = lag == 0.0
         at, left = (None, None) if arrived else (self.at.numpy(), self.left.numpy())
         for number, (mover, way) in enumerate(zip(self.movers, self._ways, strict=True)):
@@ -532,11 +530,22 @@ class Script:
                 now.poses[mover.body] = *Rotation.from_matrix(rotation).as_quat(), *(p + way.path.center)
             elif not mover.still:
                 now.times[mover.body] = come
-                if way.times[-1] < time:
-                    away = mover.place(time) - positions.numpy()[mover.vertices]
-                    lag = max(lag, float(np.linalg.norm(away, axis=1).max(initial=0.0)))
-                    why = f"and makes it up at {CATCH_UP:g} times its pace"
-        return now, lag, why
+        return now, *self._last(time, now, lag, positions)
+
+    def _last(self, time: float, now: Reached, lag: float, positions: wp.array) -> tuple[float, str]:
+        """How far, m, the last is behind its script, and the sentence that names it, or nothing; see `settle`. now: after the step."""
+        late = [isinstance(way.path, Trajectory) and way.times[-1] < time for way in self._ways]
+        if not (lag > 0.0 or any(late)):
+            return 0.0, ""
+        x, away = positions.numpy(), []
+        for mover, is_late in zip(self.movers, late, strict=True):
+            goal = mover.place(time) if is_late else self._where[mover.vertices]
+            away.append(float(np.linalg.norm(goal.astype(x.dtype) - x[mover.vertices], axis=1).max(initial=0.0)))
+        last = int(np.argmax(away))
+        lag = max(lag, away[last])
+        follows = late[last] and now.times[self.movers[last].body] == self._ways[last].times[-1]
+        why = f"and makes it up at {CATCH_UP:g} times its pace" if follows else "where something is in its way"
+        return lag, f"{self.movers[last].label} is {lag:.3g} m behind its target, {why}"
 
     # Within a step, in launches only.
 
@@ -585,6 +594,8 @@ def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: floa
     `stopped`. What came before was looked at in the steps before.
     """
     turn, place = path.pose(stopped)
+    from scipy.optimize import minimize_scalar  # a tenth of what the first step waits for, and seldom needed
+
     reach = mover.reach(path)
 
     def away(time: float) -> float:

@@ -154,6 +154,7 @@ def motion(real: Real) -> Any:
         base=wp.array(dtype=real.vec3),
         u=wp.array(dtype=real.vec3),
         u_tilde=wp.array(dtype=real.vec3),
+        free=wp.array(dtype=real.scalar),
         center=wp.array(dtype=wp.vec3d),  # of each body, m
         turn=wp.array(dtype=wp.vec3d),  # rad
     )
@@ -304,6 +305,8 @@ def kernels(real: Real) -> SimpleNamespace:
             t.fraction[i] = f
             arm = widened(o.base[i] + o.u[i]) - o.center[b]
             arc = vec3(curved(arm, wide(f) * o.turn[b])) - f * vec3(curved(arm, o.turn[b]))
+            if o.free[i] == scalar(0.0):
+                arc = vec3()
             t.u_end[i] = o.u[i] + f * (o.u_tilde[i] - o.u[i]) + arc
             t.x_end[i] = o.base[i] + t.u_end[i]
 
@@ -727,7 +730,7 @@ class Descent:
         self.limits.budget_ms = settings.budget_ms or 0.0
         self.motion = motion(real)()
         self.motion.base, self.motion.u, self.motion.u_tilde = work.x_start, work.u, work.u_tilde
-        self.motion.center, self.motion.turn = self.center, self.turn
+        self.motion.free, self.motion.center, self.motion.turn = model.free, self.center, self.turn
         self.pairs.project = self.project
         tied = {int(owner[v]) for s in model.projector.sets if s.kind in TIES for v in s.vertices.ravel()}
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]

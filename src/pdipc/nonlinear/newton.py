@@ -8,8 +8,8 @@ as `descent` has it, over the displacements u since the start of the step. Its H
 conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free nonlinear programming ... could fit in Alg. 1").
 
 The step is straight, and a straight step that rotates a body stretches it, by the square of the angle: for a body of steel more than a few
-microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So where no vertex of a
-body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
+microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So the part of the step
+that rotates the body as a whole, about what holds it if something does, becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
 p by its square, so it descends as p does, and solves as fast as p where that is small. A step that would rotate by more than a radian is made in part.
 
 Where the Hessian is indefinite the projected one takes its place, whose bound makes steps creep along directions that the potential curves down in; as
@@ -27,6 +27,7 @@ scripted goes from waypoint to waypoint, an outer iteration each where nothing i
 import functools
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from pdipc.barrier import exact, friction
@@ -35,7 +36,7 @@ from pdipc.barrier.restitution import Restitution
 from pdipc.constraints.projector import corners
 from pdipc.constraints.projector import kernels_of as elastic_kernels
 from pdipc.device import blocks
-from pdipc.device.language import func, kernel
+from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Largest, Parts, Share
 from pdipc.device.precision import Real
 from pdipc.integration import status
@@ -44,9 +45,10 @@ from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, Search, bodies, curved, turned, widened
+from pdipc.nonlinear.descent import Descent, Search, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
+GRIP = 1.0e6  # how much more than all of them those weigh that are held
 MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
@@ -58,16 +60,18 @@ REBOUND_TOLERANCE = {
 }  # of the one solve for restitution: what is left of it acts as from outside
 
 
-@func
-def sampled(k: int, number: int, count: int) -> int:
-    """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
-    # In Warp's language the quotient of integers is one.
-    return (k * count) / number + (k * 37) % (count / number)
+@struct
+class Samples:
+    """The vertices of each body that tell how it rotates; see `samples_of`."""
+
+    starts: wp.array[wp.int32]
+    vertices: wp.array[wp.int32]
+    weights: wp.array[wp.float64]  # kg
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4, Led, Bodies = real.scalar, real.vec3, real.vec4, led(real), bodies(real)
+    scalar, vec3, vec4, Led = real.scalar, real.vec3, real.vec4, led(real)
     Frozen, Progress, Corners = frozen(real), status.progress(real), corners(real)
     change, elastic_total = exact.kernels(real).change, elastic_kernels(real).total
     block_largest, last_block = blocks.largest(vec4), blocks.last()
@@ -184,7 +188,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def find_turn(
         first: int,
-        bodies: Bodies,
+        bodies: Samples,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -193,23 +197,20 @@ def kernels(real: Real) -> SimpleNamespace:
         turn_out: wp.array(dtype=wp.vec3d),
         part_out: wp.array(dtype=scalar),
     ):
-        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held.
+        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point, as its samples tell.
         A part of the step is made where all of it would rotate by more than MOST_TURN."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
         start = bodies.starts[b]
-        count = bodies.ends[b] - start
-        number = wp.min(count, SAMPLES)
-        if bodies.whole[b] == 0:
-            number = 0
-        origin = base[start]
+        end = bodies.starts[b + 1]
+        origin = base[bodies.vertices[start]]
         total = wide(0.0)
         center = wp.vec3d()
         mean = wp.vec3d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(bodies.mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = bodies.vertices[k]
+            m = bodies.weights[k]
             total += m
             center += m * widened((base[i] - origin) + u[i])
             mean += m * widened(p[i])
@@ -222,9 +223,9 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = wp.vec3d()
         square = wide(0.0)
         outer = wp.mat33d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(bodies.mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = bodies.vertices[k]
+            m = bodies.weights[k]
             arm = widened((base[i] - origin) + u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
@@ -232,17 +233,16 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = total_vector(momentum)
         square = total_number(square)
         outer = total_matrix(outer)
-        turn = wp.vec3d()
-        if number > 0:
-            turn = wide(stretch[0]) * turned(square, outer, momentum)
+        if lane == 0:
+            turn = wp.vec3d()
+            if square > wide(0.0):
+                turn = wide(stretch[0]) * turned(square, outer, momentum)
             if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
-        if lane == 0:
             part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
-            turn = part * turn
-            part_out[b] = scalar(part)
             center_out[b] = widened(origin) + center
-            turn_out[b] = turn
+            turn_out[b] = part * turn
+            part_out[b] = scalar(part)
 
     @kernel(module)
     def propose(
@@ -267,7 +267,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if o.free[i] > scalar(0.0):
             step = stretch[0] * step
         b = body[i]
-        if b >= 0 and moved < scalar(wp.inf):
+        if b >= 0 and o.free[i] > scalar(0.0) and moved < scalar(wp.inf):
             step = part[wp.max(b, 0)] * step
             step += vec3(curved(widened(o.base[i] + o.u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
         u_tilde = o.u[i] + step
@@ -334,6 +334,26 @@ def kernels(real: Real) -> SimpleNamespace:
     )
 
 
+def samples_of(vertices: np.ndarray, free: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a body that tell how it rotates as a whole, and their weights: masses, and for what is held far more than all of these,
+    so that a body turns about what holds it and not at all where that is more than an axis.
+
+    vertices: (k,); free: (n,) bool; mass: (n,) kg. Returns at most SAMPLES of each kind, (s,) int and (s,) kg.
+    """
+    loose, held = vertices[free[vertices]], vertices[~free[vertices]]
+    loose, held = (_spread(each, SAMPLES) for each in (loose, held))
+    grip = np.full(len(held), GRIP * mass[loose].sum() / max(1, len(held)))
+    return np.concatenate([loose, held]), np.concatenate([mass[loose], grip])
+
+
+def _spread(vertices: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of them: all where they are few, else spread, and not along the rows of a grid."""
+    if len(vertices) <= most:
+        return vertices
+    k, every = np.arange(most), len(vertices) // most
+    return vertices[k * len(vertices) // most + (37 * k) % every]
+
+
 class Newton(Descent):
     """The nonlinear solve of Algorithm 1 by projected Newton; see `nonlinear.Method` for the seam."""
 
@@ -342,7 +362,7 @@ class Newton(Descent):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count
         self.kernels = kernels(real)
-        free = model.free_vertices
+        free, mass = model.free_vertices, model.mass.numpy().astype(np.float64)
         self.matrix = BlockMatrix(device, real, model.projector, model.held, free)
         equations = (device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
         operators = (exact.operator(real), friction.operator(real))
@@ -354,7 +374,13 @@ class Newton(Descent):
         def zeros(dtype, count=n):
             return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
 
-        self.unheld = self._bodies([bool(free[low:high].all()) for low, high in self.ranges])
+        found = [samples_of(np.arange(low, high), free, mass) for low, high in self.ranges]
+        starts = np.cumsum([0, *(len(samples) for samples, _ in found)])
+        samples, weights = (np.concatenate([*side, [0]]) for side in zip(*found, strict=True)) if found else ([0], [0.0])
+        self.samples = Samples()
+        arrays = {"starts": (starts, np.int32), "vertices": (samples, np.int32), "weights": (weights, np.float64)}
+        for name, (values, kind) in arrays.items():
+            setattr(self.samples, name, wp.array(np.asarray(values, dtype=kind), device=device.warp))
         vec3, scalar = real.vec3, real.scalar
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.curves = (zeros(scalar) for _ in range(2))
@@ -433,7 +459,7 @@ class Newton(Descent):
         inputs += [self.measured.share, self.largest, self.stretch]
         device.launch_blocks(k.measure, self.measured.number, inputs, grain=self.measured.size)
         if self.bodies:
-            inputs = [self.unheld, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.part]
+            inputs = [self.samples, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
         inputs = [led, self.p, self.islands.body, self.center, self.turn, self.part, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
