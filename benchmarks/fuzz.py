@@ -34,7 +34,7 @@ from pdipc.scene import check, generators, meshes, worker
 from pdipc.scene.errors import SceneError
 from pdipc.scene.frames import read_frames
 
-CACHES = (".npz", ".usda", ".usdc")  # formats that hold frames
+CACHES = (".npz", ".usda", ".usdc", ".abc")  # formats that hold frames
 LIMIT = 60  # s of work on one input; ten times as long may pass by the clock, where the machine is busy
 OUTCOMES = ("read", "simulated", "refused", "foreign", "hang")
 STEPPED = 20  # one in so many of the scenes that are found good is simulated for a step
@@ -156,7 +156,31 @@ def mesh_files(folder: Path) -> list[Path]:
             prim.CreateFaceVertexCountsAttr([3] * len(skin.triangles))
             prim.CreateFaceVertexIndicesAttr([int(k) for k in skin.triangles.ravel()])
             stage.Save()
+    with contextlib.suppress(ImportError):
+        write_archive(folder / "a.abc", skin)
     return sorted(folder.iterdir())
+
+
+def write_archive(path: Path, skin: meshes.Mesh) -> None:
+    """An Alembic archive of a mesh that deforms below a place; it is whole once this has ended."""
+    import imath  # comes with alembic3d
+    from alembic3d import Abc, AbcCoreAbstract, AbcGeom
+
+    def array(kind, values):
+        made = kind(len(values))
+        np.asarray(made)[:] = values
+        return made
+
+    archive = Abc.CreateArchiveWithInfo(str(path), "fuzz", "")
+    times = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(0.04, 0.0))
+    root = AbcGeom.OXform(archive.getTop(), "root")
+    place = AbcGeom.XformSample()
+    place.setScale(imath.V3d(2, 2, 2))
+    root.getSchema().set(place)
+    mesh = AbcGeom.OPolyMesh(root, "m", times).getSchema()
+    faces = array(imath.IntArray, skin.triangles[:, ::-1].ravel()), array(imath.IntArray, np.full(len(skin.triangles), 3))
+    mesh.set(AbcGeom.OPolyMeshSchemaSample(array(imath.V3fArray, skin.vertices), *faces))
+    mesh.set(AbcGeom.OPolyMeshSchemaSample(array(imath.V3fArray, 2 * skin.vertices)))
 
 
 # --- damage ---

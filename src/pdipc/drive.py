@@ -131,7 +131,8 @@ def _result(model: Model, state: State, work: Work, report: list[float], into: S
         status.LAGGING: behind,
         status.CAPPED: f"the cap of {s.max_outer} outer iterations ended the step",
         status.OUT_OF_TIME: f"the time budget of {s.budget_ms or 0.0:g} ms ended the step after {outer} outer iterations",
-        status.STALLING: f"no direction lowered the potential any more after {outer} outer iterations",
+        status.STALLING: f"no direction lowered the potential any more after {outer} outer iterations"
+        + (", where float32 tells no more" if model.real.name == "float32" else ""),
         status.NOT_FINITE: "the iterate is not finite; the step kept the last feasible state",
     }[code]
     if lag > 0.0 and code not in (status.LAGGING, status.CONVERGED):

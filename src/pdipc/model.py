@@ -1,7 +1,6 @@
 """The model: what stays constant during a simulation, assembled once from a scene; and the state that a step changes."""
 
 import functools
-import os
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from pdipc.collision import faces, surface
 from pdipc.collision.candidates import REST_SEPARATION, ROD_SEPARATION
 from pdipc.device.launch import Device, one_at_a_time
 from pdipc.device.precision import Real, real
+from pdipc.device.threads import thread_count_for
 from pdipc.integration.loads import ExternalForces
 from pdipc.integration.script import Reached
 from pdipc.linear.affine import Follower
@@ -26,15 +26,15 @@ from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
+from pdipc.scene.reach import unresolved
 from pdipc.scene.schema import Scene, uses_newton
 from pdipc.scene.worlds import refuse_worlds
-
-ALONE = 400  # vertices of a model that one thread steps: two would lose more in waiting for each other than they win, on a busy machine most
-DEFAULT_PRECISION = {"cpu": "float64", "cuda": "float32"}  # what measures better at equal result
 
 # The coarse system of two-level is solved in one thread: good for a CPU's core, not for a GPU's.
 DEFAULT_SOLVER = {"cpu": {"barrier": "two-level", "paper": "a-jacobi"}, "cuda": {"barrier": "pcg", "paper": "a-jacobi"}}
 
+# Of outer iterations. The hardest impacts of random scenes take Newton's method 555; the others creep where they have not converged by then.
+MAX_OUTER = {"newton": 1000, "local-global": 100, "printed": 100}
 
 TOLERANCE_SPEED, TOLERANCE_PART = 0.01, 1e-3  # the default: m/s, and the part of the smallest body's size
 
@@ -222,18 +222,20 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     refuse_worlds(scene, "a model")
     assembly.masses = masses
     sim = scene.simulation
-    place = device if isinstance(device, Device) else Device(device or sim.device, threads_for(len(assembly.positions)))
-    number = real(DEFAULT_PRECISION["cuda" if place.is_cuda else "cpu"] if sim.precision == "auto" else sim.precision)
+    place = device if isinstance(device, Device) else Device(device or sim.device, thread_count_for(len(assembly.positions)))
+    number = real(_precision(sim.precision, place.is_cuda, unresolved(scene, assembly)))
     told = len(assembly.notes)
     refuse(scene, assembly, number.name)
-    for note in assembly.notes[told:]:
+    for note in [*assembly.notes[told:], *(unresolved(scene, assembly) if number.name == "float32" else [])]:
         warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene.settled(), assembly, place, number)
 
 
-def threads_for(vertices: int) -> int | None:
-    """CPU threads of a model of so many vertices; None for as many as there may be, which PDIPC_THREADS always says by itself."""
-    return 1 if vertices <= ALONE and not os.environ.get("PDIPC_THREADS", "").strip() else None
+def _precision(wanted: str, on_cuda: bool, too_stiff: list[str]) -> str:
+    """What the scene wants, else float64 on CPUs and wherever float32 does not resolve a body, and float32 on CUDA."""
+    if wanted != "auto":
+        return wanted
+    return "float32" if on_cuda and not too_stiff else "float64"
 
 
 def reassembled(model: Model, assembly: Assembly) -> Model:
@@ -290,11 +292,12 @@ def _settings(scene: Scene, assembly: Assembly) -> Settings:
     truncation = contact.truncation
     if truncation == "auto":
         truncation = "global" if contact.method == "paper" else "per_vertex"
+    solver = _nonlinear_solver(scene)
     return Settings(
         time_step=h,
-        nonlinear_solver=_nonlinear_solver(scene),
+        nonlinear_solver=solver,
         tolerance=_tolerance(sim, assembly),
-        max_outer=sim.max_outer,
+        max_outer=sim.max_outer or MAX_OUTER[solver],
         inner_iterations=sim.inner_iterations,
         activation_distance=assembly.activation_distance,
         slip_threshold=contact.friction_velocity * h,

@@ -132,7 +132,7 @@ def test_bodies_are_prims_and_the_scene_has_their_materials(shot):
     [
         ("shot.usda</World/Shet>", r'no prim "/World/Shet".*/World/Set/Sheet, /World/Cube, /World/Floor'),
         ("shot.usda<World>", 'no prim "World"'),
-        ("other.obj</World>", "only USD files have prims"),
+        ("other.obj</World>", "only USD and Alembic files have named parts"),
         ("none.usda</World>", "no such file"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from physics.scenes import scene, solid
 
@@ -25,6 +26,49 @@ def test_every_step_converges(seed, steps, monkeypatch):
     for _ in range(steps):
         result = simulation.step()
         assert result.converged, result.message
+
+
+@pytest.mark.parametrize(("seed", "steps"), [(17, 9), (6, 7)])
+def test_a_step_goes_on_while_barriers_change(seed, steps, monkeypatch):
+    """The first motions out of a stiff barrier are shorter than the tolerance, however far the way is that it opens."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import converge
+
+    from pdipc.drive import step
+
+    drawn = converge.draw(seed)
+    simulation = pdipc.Simulation(drawn, "cpu")
+    for _ in range(steps):
+        state = simulation.state.arrays()
+        result = simulation.step()
+    assert result.converged
+    strict = converge.strictly(drawn, simulation)
+    again = step(strict.model, strict.model.state_from(state), strict.work)
+    error = np.linalg.norm(again.state.positions.numpy() - simulation.positions, axis=1).max()
+    assert error <= 3.0 * simulation.model.settings.tolerance
+
+
+def test_local_global_steps_with_friction_are_not_ended_for_a_potential_that_they_do_not_lower():
+    """Friction follows their iterate and has no potential: that none fell a dozen times over says nothing."""
+    block = solid(
+        "block", (0.2, 0.2, 0.2), (2, 2, 2), young=1e8, poisson=0.3, velocity=(1.0, -1.0, 0.0), rotation=(10.0, 20.0, 30.0)
+    )
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 4.0}, "translation": (0.0, -0.2, 0.0)}
+    strict = {"nonlinear_solver": "local-global", "tolerance": 1e-8, "max_outer": 300}
+    simulation = pdipc.Simulation(scene([block], [floor], contact={"friction": 0.5}, **strict), "cpu")
+    results = [simulation.step() for _ in range(14)]
+    assert all(result.converged for result in results), [result.message for result in results if not result.converged]
+
+
+@pytest.mark.parametrize("young", [1e5, 1e9, 1e11])
+def test_what_spins_by_more_than_a_radian_a_step_is_not_stretched_by_it(young):
+    """Of steel, the first step once took 77 outer iterations: straight ones, of which each stretched it."""
+    spin = {"angular_velocity": (45.0, 150.0, 15.0)}
+    block = solid("block", (0.2, 0.1, 0.1), (4, 2, 2), young=young, poisson=0.3, **spin)
+    simulation = pdipc.Simulation(scene([block], gravity=(0, 0, 0), time_step=0.01), "cpu")
+    results = [simulation.step() for _ in range(4)]
+    assert all(result.converged for result in results)
+    assert max(result.outer for result in results) <= 10
 
 
 @pytest.mark.parametrize("speed", [1.0, 8.0])

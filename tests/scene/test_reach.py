@@ -4,9 +4,10 @@ import pytest
 from typer.testing import CliRunner
 
 import pdipc
+from pdipc import model
 from pdipc.cli import app
 from pdipc.scene.assembly import assemble
-from pdipc.scene.reach import hints
+from pdipc.scene.reach import hints, unresolved
 
 CLOTH = {"name": "cloth", "kind": "cloth", "mesh": {"shape": "grid", "cells": [4, 4]}, "translation": [0, 0.5, 0]}
 BALL = {"name": "ball", "mesh": {"shape": "sphere", "radius": 0.2}}
@@ -47,18 +48,27 @@ def test_an_activation_distance_that_is_large_beside_a_body():
 
 
 def test_a_solid_that_is_too_stiff_for_float32():
-    """Steel of 1 cm elements: sound crosses 51 m in 1/100 s, 5,100 elements; of half that size, twice as many."""
+    """Steel of 1 cm elements: sound crosses 51 m in 1/100 s, 5,100 elements; of half that size, twice as many. Who runs it is warned, too."""
 
-    def told(size, precision):
+    def made(size, precision, **simulation):
         block = {"name": "block", "kind": "solid", "mesh": {"shape": "box", "size": [2 * size] * 3, "cells": [2, 2, 2]}}
         block["material"] = {"young_modulus": 2.1e11, "density": 8000.0}
-        scene = pdipc.Scene(simulation={"precision": precision}, bodies=[block])
+        return pdipc.Scene(simulation={"precision": precision, **simulation}, bodies=[block])
+
+    def told(*given, **simulation):
+        scene = made(*given, **simulation)
         return [line for line in hints(scene, assemble(scene)) if "sound" in line]
 
     assert told(1e-2, "float32") == []
     (line,) = told(5e-3, "float32")
     assert '"block"' in line and "10247 elements" in line
     assert told(5e-3, "float64") == []
+    assert told(5e-3, "float32", substeps=2) == []
+    with pytest.warns(pdipc.SceneWarning, match='"block" in a step'):
+        pdipc.Simulation(made(5e-3, "float32"), "cpu")
+    too_stiff = unresolved(made(5e-3, "auto"), assemble(made(5e-3, "auto")))
+    assert model._precision("auto", True, too_stiff) == "float64"
+    assert model._precision("auto", True, []) == "float32"
 
 
 def test_check_scene_prints_it(tmp_path):

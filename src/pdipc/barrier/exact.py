@@ -265,7 +265,7 @@ def kernels(real: Real) -> SimpleNamespace:
             for s in range(4):
                 if held[q[s]] > zero:
                     yields += a[s] * a[s] / held[q[s]]
-            d = pairs.gaps[k]
+            d = wp.abs(pairs.gaps[k])  # that of a pair that is foreseen has the sign of its side
             after = wp.max(d + wp.dot(pairs.normals[k], lever), scalar(0.1) * d)
             now = pairs.stiffness[k] * yields * barrier.barrier_hessian(d, pairs.activation[k])
             then = pairs.stiffness[k] * yields * barrier.barrier_hessian(after, pairs.activation[k])

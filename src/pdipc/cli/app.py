@@ -59,6 +59,7 @@ app = typer.Typer(
 EXTRAS = {
     "pictures": ("pyvista", "vtkmodules", "imageio", "matplotlib"),
     "usd": ("pxr",),
+    "alembic": ("alembic3d",),
     "viewer": ("viser", "websockets"),
     "witness": ("ipctk",),
     "tetrahedralize": ("pytetwild",),

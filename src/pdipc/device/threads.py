@@ -16,6 +16,7 @@ from typing import Any
 CGROUPS = Path("/sys/fs/cgroup")
 GROUPS_OF_PROCESS = Path("/proc/self/cgroup")
 UNLIMITED = 1e6  # CPUs
+ALONE = 250  # vertices of a model that one thread steps: two would lose more in waiting for each other than they win, on a busy machine most
 
 _turn = threading.RLock()
 _pool: ThreadPoolExecutor | None = None
@@ -70,6 +71,11 @@ def thread_count() -> int:
         return int(wanted)
     # one thread that has used up the container's time keeps all others waiting, so quotas are rounded down
     return max(1, min(cores(), int(_quota(GROUPS_OF_PROCESS, CGROUPS))))
+
+
+def thread_count_for(vertices: int) -> int | None:
+    """CPU threads of a model of so many vertices; None for as many as there may be, which PDIPC_THREADS always says by itself."""
+    return 1 if vertices <= ALONE and not os.environ.get("PDIPC_THREADS", "").strip() else None
 
 
 def cores() -> int:

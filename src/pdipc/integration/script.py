@@ -44,7 +44,7 @@ from pdipc.scene.movers import MOST, Mover, movers_of
 CATCH_UP = 2.0  # times the script's pace
 LOOKS = 4  # times in a step at which a late mover looks whether its script has come back
 TRIES = 24  # outer iterations in which a mover goes on to one waypoint
-PATIENCE = 0.7  # of the cap of outer iterations
+PATIENCE, MOST_PATIENCE = 0.7, 70.0  # of the cap of outer iterations, and outer iterations
 AHEAD, ARRIVED, WILL = (wp.constant(place) for place in range(3))  # flags, see `Script`
 
 
@@ -295,7 +295,7 @@ class Script:
 
     def __init__(self, assembly: Assembly, device: Device, real: Real, h: float, max_outer: int):
         self.assembly, self.device, self.real, self.h, self.kernels = assembly, device, real, h, kernels(real)
-        self.movers, self.generation, self.patience = movers_of(assembly), 0, int(PATIENCE * max_outer)
+        self.movers, self.generation, self.patience = movers_of(assembly), 0, int(min(PATIENCE * max_outer, MOST_PATIENCE))
         self.leads: dict[int, Lead] = {}
         self.soft = rows_of_anchors(assembly)
         self.anchors: np.ndarray | None = None

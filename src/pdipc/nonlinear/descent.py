@@ -87,6 +87,13 @@ def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
     return result
 
 
+@func
+def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
+    """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
+    # a little more than the inertia, for bodies on a line
+    return wp.inverse(wp.float64(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wp.float64) - outer) * momentum
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
@@ -374,8 +381,7 @@ def kernels(real: Real) -> SimpleNamespace:
         if lane == 0:
             left = wide(0.0)
             if total > wide(0.0) and square > wide(0.0):
-                # a little more than the inertia, for bodies on a line
-                turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * torque
+                turn = turned(square, outer, torque)
                 left = wide(h) * wide(h) * (wp.length(force) / total + wp.sqrt(square / total) * wp.length(turn))
             left_out[b] = scalar(left)
 
@@ -428,6 +434,7 @@ def kernels(real: Real) -> SimpleNamespace:
         tolerance: scalar,
         most_change: scalar,
         max_outer: int,
+        most_idle: int,
         budget_ms: wide,
         numbers: wp.array(dtype=scalar),
         count: wp.array(dtype=wp.int32),
@@ -465,13 +472,16 @@ def kernels(real: Real) -> SimpleNamespace:
             count[status.IDLE] = count[status.IDLE] + 1
             if lowered[0] != 0 or count[status.MOVING] != 0 or script[ARRIVED] != 0:
                 count[status.IDLE] = 0
+            most_rounded = scalar(ROUNDED) * tolerance
             if projected[0] != 0:
                 left = left / scalar(EXACT)
+                most_rounded = scalar(EXACT) * most_rounded
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
             done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= most_change
             if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
                 done = True
-            if count[status.IDLE] >= IDLE and left <= scalar(ROUNDED) * tolerance:
+            # and where nothing falls for long, motions are rounding's: their ratios say nothing
+            if count[status.IDLE] >= most_idle and wp.max(residual, numbers[status.UNBALANCED]) <= most_rounded:
                 done = True
             settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
             if residual >= scalar(wp.inf):
@@ -480,7 +490,7 @@ def kernels(real: Real) -> SimpleNamespace:
                 code = status.CONVERGED
             elif settled and script[WILL] == 0:
                 code = status.LAGGING
-            elif count[status.STALLED] >= STALLS or count[status.IDLE] >= IDLE:
+            elif count[status.STALLED] >= STALLS or count[status.IDLE] >= most_idle:
                 code = status.STALLING
             elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
@@ -613,9 +623,10 @@ class Descent:
         tied = {int(owner[v]) for s in model.projector.sets if s.kind in TIES for v in s.vertices.ravel()}
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
         self.weighs = weighs and any(whole)
-        self.balanced = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
-        self.unbalanced = zeros(scalar, self.bodies)
-        self.largest_of_bodies = Largest(device, real, [max(1, self.bodies)])
+        if self.weighs:
+            self.balanced = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
+            self.unbalanced = zeros(scalar, self.bodies)
+            self.largest_of_bodies = Largest(device, real, [self.bodies])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
@@ -765,7 +776,8 @@ class Descent:
             self.lowered,
         ]
         change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
-        limits = [model.real.scalar(s.tolerance), model.real.scalar(change), s.max_outer, s.budget_ms or 0.0]
+        most_idle = IDLE if self.descends else s.max_outer  # what need not lower the potential does not idle where it does not
+        limits = [model.real.scalar(s.tolerance), model.real.scalar(change), s.max_outer, most_idle, s.budget_ms or 0.0]
         times = [w.candidates.overflow, w.clock]
         device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, w.count, w.going])
         which = [self.islands.label, self.islands.driven, self.squeezed, self.attempts, self.island_least]

@@ -10,7 +10,7 @@ conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free 
 The step is straight, and a straight step that rotates a body stretches it, by the square of the angle: for a body of steel more than a few
 microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So where no vertex of a
 body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
-p by its square, so it descends as p does, and solves as fast as p where that is small.
+p by its square, so it descends as p does, and solves as fast as p where that is small. A step that would rotate by more than a radian is made in part.
 
 Where the Hessian is indefinite the projected one takes its place, whose bound makes steps creep along directions that the potential curves down in; as
 long as they do not shrink, each is tried with twice the length of the last.
@@ -42,10 +42,10 @@ from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, curved, widened
+from pdipc.nonlinear.descent import Descent, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
-MOST_TURN = 0.5  # rad of a step: more is not one of Newton's
+MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
 NEAR = 10.0  # tolerances: a step that is shorter, at indefinite Hessians, is one away from a saddle
@@ -175,8 +175,10 @@ def kernels(real: Real) -> SimpleNamespace:
         stretch: wp.array(dtype=scalar),
         center_out: wp.array(dtype=wp.vec3d),
         turn_out: wp.array(dtype=wp.vec3d),
+        part_out: wp.array(dtype=scalar),
     ):
-        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held."""
+        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held.
+        A part of the step is made where all of it would rotate by more than MOST_TURN."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
@@ -216,12 +218,13 @@ def kernels(real: Real) -> SimpleNamespace:
         outer = total_matrix(outer)
         turn = wp.vec3d()
         if number > 0:
-            # a little more than the inertia, for bodies on a line
-            turn = wp.inverse(wide(1.0 + 1.0e-9) * square * wp.identity(n=3, dtype=wide) - outer) * momentum
-            turn = wide(stretch[0]) * turn
-            if not (wp.length(turn) < wide(MOST_TURN)):
+            turn = wide(stretch[0]) * turned(square, outer, momentum)
+            if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
         if lane == 0:
+            part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
+            turn = part * turn
+            part_out[b] = scalar(part)
             center_out[b] = widened(origin) + center
             turn_out[b] = turn
 
@@ -235,6 +238,7 @@ def kernels(real: Real) -> SimpleNamespace:
         body: wp.array(dtype=wp.int32),
         center: wp.array(dtype=wp.vec3d),
         turn: wp.array(dtype=wp.vec3d),
+        part: wp.array(dtype=scalar),
         target: wp.array(dtype=vec3),
         mover: wp.array(dtype=wp.int32),
         drive: wp.array(dtype=wp.int32),
@@ -253,6 +257,7 @@ def kernels(real: Real) -> SimpleNamespace:
             step = stretch[0] * step
         b = body[i]
         if b >= 0 and moved < scalar(wp.inf):
+            step = part[wp.max(b, 0)] * step
             step += vec3(curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
         u_tilde = u[i] + step
         if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
@@ -357,6 +362,7 @@ class Newton(Descent):
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.forces, self.scales = (zeros(scalar) for _ in range(3))
         self.lengths, self.stretch, self.unrestrained = zeros(scalar, 2), zeros(scalar, 1), zeros(scalar, self.bodies)
+        self.part = zeros(scalar, self.bodies)
         self.renew, self.driving = zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.driven = zeros(wp.int32)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -424,9 +430,9 @@ class Newton(Descent):
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
         if self.bodies:
             inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p]
-            inputs += [self.stretch, self.center, self.turn]
+            inputs += [self.stretch, self.center, self.turn, self.part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
-        inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn]
+        inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn, self.part]
         inputs += [w.script.target, w.script.mover, w.script.drive, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 

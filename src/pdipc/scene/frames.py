@@ -33,7 +33,9 @@ def read_frames(name: str, frame_rate: float | None, worker: Worker | None = Non
     contents = meshes.contents(path, worker, frames=True)
     where = f'cache "{path}"'
     if contents.frames is None:
-        raise SceneError(f"{where}: holds one frame only; needed: several, in .npz as V (frames, n, 3), in USD as time samples")
+        raise SceneError(
+            f"{where}: holds one frame only; needed: several, in .npz as V (frames, n, 3), in USD and Alembic as time samples"
+        )
     return timed(contents.frames, contents.times, frame_rate, where), contents
 
 

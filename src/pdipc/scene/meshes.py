@@ -21,7 +21,7 @@ from pdipc.scene.worker import Worker, failed
 TET_SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele")
 TRIANGLE_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".vtp", ".glb")
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", *USD_SUFFIXES)
+SUFFIXES = (*TET_SUFFIXES, *TRIANGLE_SUFFIXES, ".npz", *USD_SUFFIXES, ".abc")
 BYTES_PER_BYTE = 2  # of memory for a mesh file, at least: the file itself and its numbers
 FLAT = 1e-9  # a tet or triangle of less than this part of its longest edge^3 or ^2 has no rest shape to speak of
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # outward for a tet of positive volume
@@ -154,7 +154,7 @@ def locate(name: str) -> Path:
 
 
 def split_prim(path: Path) -> tuple[Path, str | None]:
-    """The file and the prim of a name such as `shot.usda</World/Cloth>`, as USD itself writes them; None where it names no prim."""
+    """The file and the prim of a name such as `shot.usda</World/Cloth>`, as USD itself writes them, or the object of an archive; None where it names none."""
     file, bracket, prim = str(path).partition("<")
     return (Path(file), prim[:-1].replace("\\", "/")) if bracket and prim.endswith(">") else (path, None)
 
@@ -211,8 +211,8 @@ def contents(path: Path, worker: Worker | None = None, frames: bool = False) -> 
         )
     if not is_file(path):
         raise SceneError(f'mesh file "{_short(path)}": there is no such file')
-    if prim is not None and suffix not in USD_SUFFIXES:
-        raise SceneError(f'mesh file "{_short(path)}": has no prim "{prim}"; only USD files have prims')
+    if prim is not None and suffix not in (*USD_SUFFIXES, ".abc"):
+        raise SceneError(f'mesh file "{_short(path)}": has no prim "{prim}"; only USD and Alembic files have named parts')
 
     def read() -> Contents:
         needed, free = BYTES_PER_BYTE * path.stat().st_size, free_memory()

@@ -41,19 +41,30 @@ def hints(scene: Scene, assembly: Assembly) -> list[str]:
                 f'the activation distance of {d_hat:.3g} m is {100 * d_hat / size:.0f} % of the size of "{body.name}", '
                 f"{size:.3g} m, so others are felt from that far; {1e-3 * size:.2g} m would be the default for it alone"
             )
-        if body.kind == "solid" and scene.simulation.precision == "float32":
-            assert isinstance(body.material, SolidMaterial)
-            corners = assembly.positions[body.tets]
-            element = float(
-                min(np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min() for a, b in itertools.combinations(range(4), 2))
+    if scene.simulation.precision == "float32":
+        found += unresolved(scene, assembly)
+    return found
+
+
+def unresolved(scene: Scene, assembly: Assembly) -> list[str]:
+    """A line for each solid that is too stiff for float32."""
+    found, most = [], np.sqrt(STIFF / 2.0**-24)
+    for body in assembly.bodies:
+        if body.kind != "solid" or not len(body.tets):
+            continue
+        assert isinstance(body.material, SolidMaterial)
+        corners = assembly.positions[body.tets]
+        element = float(
+            min(np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min() for a, b in itertools.combinations(range(4), 2))
+        )
+        h = scene.simulation.time_step
+        speed = np.sqrt(body.material.young_modulus / body.material.density)
+        crossed = speed * h / scene.simulation.substeps / element if element > 0.0 else 0.0
+        if crossed > most:
+            found.append(
+                f'sound crosses {crossed:.0f} elements of "{body.name}" in a step, and with more than {most:.0f} what float32 rounds in elastic forces '
+                f"outweighs inertia, so steps may not converge: use float64, a rigid body, or a time step of {h * most / crossed:.2g} s"
             )
-            crossed = np.sqrt(body.material.young_modulus / body.material.density) * h / element
-            most = np.sqrt(STIFF / 2.0**-24)
-            if crossed > most:
-                found.append(
-                    f'sound crosses {crossed:.0f} elements of "{body.name}" in a step, and with more than {most:.0f} what float32 rounds in elastic forces '
-                    f"outweighs inertia, so steps may end at the cap of outer iterations: use float64, a rigid body, or a time step of {h * most / crossed:.2g} s"
-                )
     return found
 
 

@@ -60,8 +60,8 @@ mesh = {{ shape = "sphere", radius = 0.3, cells = 12 }}
 A mesh is one of
 
 - a file, relative to the scene file: tets from {" ".join(TET_SUFFIXES)}, triangles from {" ".join(TRIANGLE_SUFFIXES)},
-  lines from .obj, `.npz` with V and T, F or L, and USD (with the extra "usd"), whole or below a prim: `shot.usda</World/Flag>`; `warp:bear.usd` is the
-  file of that name among Warp's own assets;
+  lines from .obj, `.npz` with V and T, F or L, USD (with the extra "usd"), whole or below a prim: `shot.usda</World/Flag>`, and Alembic
+  (.abc, with the extra "alembic"), whole or below an object: `shot.abc</Flag>`; `warp:bear.usd` is the file of that name among Warp's own assets;
 - a shape, such as `{{ shape = "box", size = [1, 1, 1], cells = [4, 4, 4] }}`;
 - arrays, `{{ vertices = [...], tets = [...] }}`: in Python, NumPy arrays.
 
@@ -72,7 +72,7 @@ manifolds; obstacles need not be, and lose triangles without area or that repeat
 
 Quads and polygons, concave ones too, are cut into triangles, and hexahedra, wedges and pyramids into tets, alike on both sides of
 a face. Cells of higher order are reduced to their corners. All meshes of a USD stage are read, where they stand, in its unit and
-with its upward axis turned to y; other formats know no unit: their numbers are metres. What is left out of a file or converted
+with its upward axis turned to y, and all of an Alembic archive, where they stand; other formats than USD know no unit: their numbers are metres. What is left out of a file or converted
 is said by `pdipc run` and `pdipc check-scene`, and in Python by a SceneWarning.
 
 An obstacle may deform: `motion = {{ cache = "dance.npz", frame_rate = 25 }}`, see [Deformation](#deformation).

@@ -73,7 +73,8 @@ class Simulation(Table):
         description="Mass-proportional damping, 1/s: the part of its velocity that a free body loses per second.",
     )
     precision: Literal["auto", "float32", "float64"] = Field(
-        default="auto", description='Working precision; "auto" takes what measured faster on the device.'
+        default="auto",
+        description='Working precision; "auto": float64 on CPUs; on CUDA float32, unless a solid is too stiff for it.',
     )
     device: str | None = Field(default=None, description='"cpu" or "cuda:0"; absent: CUDA where there is one, else the CPU.')
     tolerance: Positive | None = Field(
@@ -92,11 +93,12 @@ class Simulation(Table):
         description='How the nonlinear problem of a step is solved; "auto" is newton, unless a setting of local-global '
         "(inner_iterations, linear_solver, linear_iterations, linear_tolerance, solver_order, solver_drop) is given.",
     )
-    max_outer: Whole = Field(
-        default=100,
+    max_outer: Whole | None = Field(
+        default=None,
         ge=1,
         le=10**6,
-        description="Most outer iterations of a step; a step that ends here is feasible, and says so.",
+        description="Most outer iterations of a step; a step that ends here is feasible, and says so. Absent: 1000 by Newton's method, "
+        "whose hardest impacts take hundreds, else 100.",
     )
     inner_iterations: Whole = Field(
         default=30, ge=1, le=10**6, description="Most local-global iterations in an outer iteration."
@@ -347,8 +349,8 @@ class Placed(Table):
 
     name: str = Field(min_length=1, max_length=200, description="Name, unique in the scene.")
     mesh: MeshSource = Field(
-        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp; of USD also one prim, "
-        "`shot.usda</World/Flag>`), a shape, or arrays."
+        description="A mesh file (relative to the scene file, or `warp:FILE` for an asset of Warp; of USD and Alembic also "
+        "a part, `shot.usda</World/Flag>`), a shape, or arrays."
     )
     scale: Positive | tuple[Positive, Positive, Positive] = Field(
         default=1.0, description="Factor on the mesh's coordinates; along x, y, z if three."
@@ -820,7 +822,7 @@ class Deformation(Table):
             custom_error_message="must be a file, a pattern of files, or a table with vertices and times",
         ),
     ] = Field(
-        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD), a pattern of files that are a frame each, "
+        description="A file with V (frames, n, 3) and times (.npz) or time samples (USD, Alembic), a pattern of files that are a frame each, "
         "such as `body_*.obj`, or arrays; of as many vertices as the mesh has."
     )
     frame_rate: Positive | None = Field(

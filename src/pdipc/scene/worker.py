@@ -189,6 +189,7 @@ def describe(error: BaseException) -> str:
     except Exception:
         text = ""
     text = re.sub(r"Error in '[^']*' at line \d+ in file \S+ : ", "", text)  # USD says where in its own source
+    text = re.sub(r"\S+\([^()]*\)\s+ERROR: EXCEPTION:\s+", "", text)  # and so does Alembic
     return text.strip() or type(error).__name__
 
 

@@ -1,11 +1,15 @@
 """What a mesh file holds, as it is written, before anything is cut."""
 
 import codecs
+import difflib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from pdipc.scene.errors import SceneError
+
+LISTED = 10  # parts of a file that a message names
 # Corners of each kind of cell; the further vertices of cells of higher order follow them.
 CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 ORDER_AS_HEXAHEDRON = {"pixel": ("quad", [0, 1, 3, 2]), "voxel": ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
@@ -35,6 +39,26 @@ class Damaged(ValueError):
 def lines_left_out(count: int) -> str:
     """The note for lines between vertices, such as the sewing lines of a garment."""
     return f"{count} lines were left out; springs along them can be given as attachments with pairs"
+
+
+def first_of(count: int) -> str:
+    """The note for what moves and is wanted at one time."""
+    return f"it moves or deforms at {count} times: it was read as it is at the start"
+
+
+def no_such(path: Path, what: str, wanted: str, meshes: list[str]) -> SceneError:
+    """That a file has no part, a prim or an object, of that name. meshes: the names of those that are."""
+    near = difflib.get_close_matches(wanted, meshes, n=1)
+    hint = f'; did you mean "{near[0]}"?' if near else ";"
+    listed = ", ".join(meshes[:LISTED]) + (", ..." if len(meshes) > LISTED else "")
+    return SceneError(f'mesh file "{path}": has no {what} "{wanted}"{hint} its meshes are: {listed or "none"}')
+
+
+def backwards(corners: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """The corners of polygons, one after another, with each polygon passed the other way round."""
+    ends = np.cumsum(counts)
+    within = np.arange(len(corners)) - np.repeat(ends - counts, counts)
+    return corners[np.repeat(ends, counts) - 1 - within]
 
 
 def text_of(path: Path) -> str:

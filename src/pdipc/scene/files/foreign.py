@@ -1,7 +1,6 @@
 """Formats that other packages parse: VTK and others by meshio, glTF by trimesh, USD by its own library."""
 
 import contextlib
-import difflib
 import io
 import json
 import re
@@ -11,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from pdipc.scene.errors import SceneError
-from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, Damaged
+from pdipc.scene.files.contents import CORNERS, ORDER_AS_HEXAHEDRON, Contents, Damaged, backwards, first_of, no_such
 from pdipc.scene.files.volumes import is_gmsh
 
-LISTED = 10  # prims that a message names
 MESHES = ("Mesh", "TetMesh")
 
 
@@ -157,7 +155,7 @@ def usd(path: Path, frames: bool = False, below: str | None = None) -> Contents:
     if hidden:
         found.notes.append(f"{hidden} invisible prims were left out")
     if len(times) > 1 and not frames:
-        found.notes.append(_first_of(len(times)))
+        found.notes.append(first_of(len(times)))
     return found
 
 
@@ -208,10 +206,7 @@ def _usd_prim(stage, path: Path, wanted: str):
     if prim:
         return prim
     there = [str(prim.GetPath()) for prim in stage.Traverse() if prim.GetTypeName() in MESHES]
-    near = difflib.get_close_matches(wanted, there, n=1)
-    hint = f'; did you mean "{near[0]}"?' if near else ";"
-    listed = ", ".join(there[:LISTED]) + (", ..." if len(there) > LISTED else "")
-    raise SceneError(f'mesh file "{path}": has no prim "{wanted}"{hint} its meshes are: {listed or "none"}')
+    raise no_such(path, "prim", wanted, there)
 
 
 def _usd_points(prims: list, time) -> np.ndarray:
@@ -241,9 +236,7 @@ def _usd_faces(prim, size: int, time) -> tuple[np.ndarray, np.ndarray]:
     matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
     left = prim.GetAttribute("orientation").Get(time) == UsdGeom.Tokens.leftHanded
     if (np.linalg.det(matrix[:3, :3]) < 0) != left:
-        ends = np.cumsum(sides)  # every face backwards
-        within = np.arange(len(rows)) - np.repeat(ends - sides, sides)
-        rows = rows[np.repeat(ends, sides) - 1 - within]
+        rows = backwards(rows, sides)
     kept = np.ones(len(sides), dtype=bool)
     kept[[hole for hole in prim.GetAttribute("holeIndices").Get(time) or [] if 0 <= hole < len(sides)]] = False
     return rows[np.repeat(kept, sides)], sides[kept]
@@ -284,7 +277,3 @@ def _units(stage) -> tuple[Callable[[np.ndarray], np.ndarray], list[str]]:
         return points * unit if upright else points[:, [0, 2, 1]] * [unit, unit, -unit]
 
     return convert, notes
-
-
-def _first_of(count: int) -> str:
-    return f"it moves or deforms at {count} times: it was read as it is at the start"
