@@ -173,7 +173,7 @@ def test_snapshots(tmp_path, capsys, monkeypatch):
     found = rows(tmp_path / "fig13.csv")
     assert [row["row"] for row in found] == ["dragon", "dragon", "armadillo", "armadillo"]
     assert all(row["intersections"] == "0" and row["converged"] == "True" for row in found)
-    stacked = _snapshots.stacked([np.zeros((20, 30, 3), dtype=np.uint8), np.zeros((10, 12, 3), dtype=np.uint8)])
+    stacked = _snapshots._stacked([np.zeros((20, 30, 3), dtype=np.uint8), np.zeros((10, 12, 3), dtype=np.uint8)])
     assert stacked.shape == (30 + _snapshots.GAP, 30, 3)
     assert np.all(stacked[20 : 20 + _snapshots.GAP] == 255) and np.all(stacked[-10:, :9] == 255)
     assert np.all(stacked[-10:, 9:21] == 0)

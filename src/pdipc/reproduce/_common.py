@@ -173,16 +173,17 @@ def pictures(
 ) -> list[np.ndarray]:
     """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`).
 
-    view: absent, that of the scene. beside: a run under whose camera, for the same frames, this one is drawn.
+    view: absent, that of the scene. beside: a run under whose camera, which holds all of `framed` of that run, this one is drawn.
     """
     frames = list(frames)
+    framed = list(frames if framed is None else framed)
     settings = settings_of(run).model_copy(update={"size": size} | ({"view": view} if view else {}))
     if beside is not None:
-        with drawing(beside, list(framed or frames), settings) as drawn:
+        with drawing(beside, framed, settings) as drawn:
             camera = drawn.plotter.camera
             place = {"position": tuple(camera.position), "target": tuple(camera.focal_point)}
-        settings = settings.model_copy(update=place)
-    with drawing(run, list(framed or frames), settings) as drawn:
+        settings, framed = settings.model_copy(update=place), frames
+    with drawing(run, framed, settings) as drawn:
         return [drawn.image(frame) for frame in frames]
 
 

@@ -40,7 +40,7 @@ def figure(
         if large is not None:
             (image,) = _common.pictures(done, [round(large * (done.frame_count - 1))], WIDE)
             lines.append(image)
-        lines.append(beside(_common.pictures(done, frames, PANEL)))
+        lines.append(_beside(_common.pictures(done, frames, PANEL)))
         unconverged = sum(not record["converged"] for record in done.stats)
         for record, found in zip(done.stats, crossing[1:], strict=True):
             milliseconds = sum(record["milliseconds"].values())
@@ -53,17 +53,17 @@ def figure(
         )
     header = ("row", "step", "outer", "barriers", "converged", "intersections", "milliseconds")
     _common.write_table(out / f"{name}.csv", header, table)
-    matplotlib.image.imsave(out / f"{name}.png", stacked(lines))
+    matplotlib.image.imsave(out / f"{name}.png", _stacked(lines))
     what = "the bundled scene, small" if small else "a scene of the paper's size"
     return _common.conclude(out / f"{name}.png", f"Paper, {claim} Here ({what}): {'; '.join(told)}.")
 
 
-def beside(images: Sequence[np.ndarray]) -> np.ndarray:
+def _beside(images: Sequence[np.ndarray]) -> np.ndarray:
     white = np.full((images[0].shape[0], GAP, images[0].shape[2]), 255, dtype=np.uint8)
     return np.concatenate([part for image in images for part in (white, image)][1:], axis=1)
 
 
-def stacked(lines: Sequence[np.ndarray]) -> np.ndarray:
+def _stacked(lines: Sequence[np.ndarray]) -> np.ndarray:
     """Lines of pictures, one below the other; narrower ones stand in the middle."""
     width, deep = max(line.shape[1] for line in lines), lines[0].shape[2]
     parts = []

@@ -1,11 +1,12 @@
 """Figure 11 beside IPC (Section 7.3): the helicopters by this package and by IPC from one model, and what their steps take."""
 
 import statistics
+from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 
+from pdipc.output.results import Run
 from pdipc.reproduce import _beside_ipc, _common, _scenes, _snapshots
 from pdipc.scene.assembly import assemble
 
@@ -41,10 +42,7 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
     header = ["step", "barriers"]
     header += [f"{what} of {who}" for what in ("outer", "converged", "seconds") for who in ("this package", "IPC")]
     _common.write_table(out / "fig11_ipc.csv", (*header, "mean distance, m"), table)
-    shown = [steps[round(part * (len(steps) - 1))] for part in np.linspace(1 / SHOTS, 1, SHOTS)]
-    above = _common.pictures(theirs, [steps.index(step) + 1 for step in shown], _snapshots.PANEL, beside=ours)
-    below = _common.pictures(ours, shown, _snapshots.PANEL)
-    matplotlib.image.imsave(out / "fig11_ipc.png", _snapshots.stacked([_snapshots.beside(line) for line in (above, below)]))
+    _draw(ours, theirs, steps, out / "fig11_ipc.png")
     spent = [sum(row[column] for row in table) for column in (6, 7)]
     where = f"both run all {len(steps)} steps" if small else f"steps {', '.join(map(str, steps))}, by both from the same states"
     sentence = (
@@ -58,3 +56,25 @@ def run(out_dir: str | Path, small: bool = False, device: str | None = None) -> 
         f"{1e3 * (apart[-1] if small else max(apart)):.2g} mm apart on average."
     )
     return _common.conclude(out / "fig11_ipc.png", sentence)
+
+
+def _draw(ours: Run, theirs: Run, steps: Sequence[int], path: Path) -> None:
+    """The same steps by both, under one camera."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = [steps[round(part * (len(steps) - 1))] for part in np.linspace(1 / SHOTS, 1, SHOTS)]
+    lines = {
+        "IPC": _common.pictures(theirs, [steps.index(step) + 1 for step in shown], _snapshots.PANEL, framed=shown, beside=ours),
+        "this package": _common.pictures(ours, shown, _snapshots.PANEL),
+    }
+    figure, axes = plt.subplots(2, SHOTS, figsize=(4 * SHOTS, 7), layout="constrained")
+    for line, (name, images) in zip(axes, lines.items(), strict=True):
+        for axis, step, image in zip(line, shown, images, strict=True):
+            axis.imshow(image)
+            axis.set_title(f"{name}, step {step}", fontsize=11)
+            axis.axis("off")
+    figure.savefig(path, dpi=200)
+    plt.close(figure)

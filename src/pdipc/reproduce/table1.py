@@ -362,18 +362,20 @@ def _conclude(out: Path, found: list[dict[str, Any]], machine: str, small: bool)
             if row.get(column) is not None:
                 table.add_row(column, "", str(row[column]))
         console.print(table)
+    on_cpu = all(row.get("processor ms") and row["device"] == "cpu" for row in found)
+    key, clock = ("processor ms", "ms of the processor") if on_cpu else ("median ms", "ms")
     figure, axis = plt.subplots(figsize=(7, 4.6), layout="constrained")
     told = []
     for mode, marker in zip(MODES, "os", strict=True):
         own = [row for row in found if row["mode"] == mode]
-        size, took = ([row[key] for row in own] for key in ("degrees_of_freedom", "median ms"))
+        size, took = ([row[column] for row in own] for column in ("degrees_of_freedom", key))
         if own:
             axis.loglog(size, took, marker, label=f"{mode} mode, median step")
             for row, x, y in zip(own, size, took, strict=True):
                 axis.annotate(row["title"], (x, y), fontsize=7, xytext=(4, 3), textcoords="offset points")
         if len(set(size)) > 2:
             told.append(f"{mode} mode: time grows as DOF^{np.polyfit(np.log(size), np.log(took), 1)[0]:.2f}")
-    axis.set(xlabel="degrees of freedom", ylabel="ms")
+    axis.set(xlabel="degrees of freedom", ylabel=clock)
     axis.set_title(machine, fontsize=9)
     axis.legend()
     axis.grid(alpha=0.3)
