@@ -20,7 +20,7 @@ VIEW = (0.6, 0.5, 1.0)
 
 
 def flattened(small: bool) -> Scene:
-    """A body of unit size on its back, without gravity, between boards that close steadily."""
+    """A body of unit size that lies, without gravity, between boards that close steadily."""
     path = None if small else _common.data("meshes/tet/armadillo_55k.npz")
     if path:
         mesh = meshes.read(path)
