@@ -131,7 +131,7 @@ def predict(name: str, row: dict) -> dict:
     place.launches.clear()
     algorithm.time_step(work)
     method, outer, going = work.method, row["outer"], work.going.ptr
-    conjugate = (going, method.solver._going.ptr)
+    conjugate = (going, method.solver.condition.ptr)
     turns = {
         (): 1.0,
         (going,): outer,

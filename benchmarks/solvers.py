@@ -138,7 +138,7 @@ def ours(solver, system: System, b: np.ndarray) -> Callable[[int], np.ndarray]:
 
     def run(count: int) -> np.ndarray:
         if count not in graphs:
-            solver.limits[1] = count * solver.order if isinstance(solver, MatrixPowers) else count
+            solver.max_iterations = count * solver.order if isinstance(solver, MatrixPowers) else count
             graphs[count] = system.device.capture(lambda: solver.solve(x, right))
         x.zero_()
         graphs[count].launch()

@@ -1,7 +1,8 @@
-"""Runs the scenes of rods and rigid bodies and draws their pictures: `python docs/draw_bodies.py [-o FOLDER] [NAME ...]`. Takes minutes."""
+"""Runs the scenes of garments, closed cloth, rods and rigid bodies and draws their pictures: `python docs/draw_bodies.py [-o FOLDER] [NAME ...]`. Takes minutes."""
 
 import argparse
 import tempfile
+import time
 from pathlib import Path
 
 import matplotlib
@@ -124,12 +125,99 @@ def everything() -> pdipc.Scene:
     return pdipc.Scene(bodies=bodies, obstacles=[ball, floor], simulation=simulation, contact={"friction": 0.4})
 
 
+def sleeve() -> pdipc.Scene:
+    """Two panels that are sewn around an arm, which then moves."""
+    cloth = {"areal_density": 0.2, "membrane_stiffness": 300.0, "bending_stiffness": 2e-5}
+    mesh = {"shape": "grid", "size": (0.35, 0.21), "cells": (20, 12)}
+    bodies = [
+        {"name": name, "kind": "cloth", "mesh": mesh, "translation": (0, height, 0), "material": cloth}
+        for name, height in (("front", 0.07), ("back", -0.07))
+    ]
+    seams = [
+        {"bodies": ("front", "back"), "within": 0.2, "select": {"box": [[-1, -1, low], [1, 1, high]]}, "duration": 0.3}
+        for low, high in ((0.1, 0.2), (-0.2, -0.1))
+    ]
+    bent = {"keyframes": [{"time": 0.4}, {"time": 1.4, "rotation": (0, 0, 50)}], "center": (-0.3, 0, 0)}
+    arm = {"name": "arm", "mesh": {"shape": "capsule", "radius": 0.05, "length": 0.5, "cells": (8, 10)}}
+    arm |= {"rotation": (0, 0, 90), "motion": bent, "look": {"color": "#d8c4b2"}}
+    contact = {"activation_distance": 2e-3, "friction": 0.3}
+    return pdipc.Scene(bodies=bodies, obstacles=[arm], stitches=seams, contact=contact, simulation={"steps": 150})
+
+
+def pillows() -> pdipc.Scene:
+    """Three flat boxes of cloth that a gas fills, on a floor."""
+    pillow = {
+        "name": "pillow",
+        "kind": "cloth",
+        "mesh": {"shape": "box", "size": (0.4, 0.02, 0.4), "cells": (12, 1, 12)},
+        "translation": (0, 0.05, 0),
+        "material": {"areal_density": 0.3, "membrane_stiffness": 400.0, "bending_stiffness": 1e-4},
+        "inside": {"gas": 101325.0, "volume": 0.011, "rise": 0.3},
+        "copies": {"counts": (1, 3, 1), "spacing": (0, 0.12, 0)},
+    }
+    floor = {"name": "floor", "mesh": {"shape": "plane", "size": 2.0}}
+    contact = {"activation_distance": 3e-3, "friction": 0.5}
+    return pdipc.Scene(bodies=[pillow], obstacles=[floor], contact=contact, simulation={"steps": 100})
+
+
+def tunic() -> pdipc.Scene:
+    """Two flat panels of woven cloth that are sewn at the shoulders and the sides around a body, which then turns."""
+    wide, tall, neck, armhole = 0.40, 0.44, 0.09, 0.13
+    woven = {"areal_density": 0.2, "membrane_stiffness": 1000.0, "weft_stiffness": 400.0, "shear_stiffness": 60.0}
+    woven |= {"bending_stiffness": 6e-5, "weft_bending_stiffness": 1.5e-5, "warp": (0, 1, 0)}
+    mesh = {"shape": "grid", "size": (wide, tall), "cells": (18, 20)}
+    bodies = [
+        {"name": name, "kind": "cloth", "mesh": mesh, "rotation": (90, 0, 0), "translation": (0, 0.0, z), "material": woven}
+        for name, z in (("front", 0.14), ("back", -0.14))
+    ]
+    for body, color in zip(bodies, ("#c8508a", "#8a50c8"), strict=True):
+        body["look"] = {"color": color}
+        body["pins"] = [
+            {"select": {"box": [[-1, 0.5 * tall - 0.01, -1], [1, 1, 1]]}, "axes": "y", "stiffness": 50.0, "end": 0.45}
+        ]
+    x, y = 0.5 * wide, 0.5 * tall
+    places = [[[-x - 0.01, -1, -1], [-x + 0.01, y - armhole, 1]], [[x - 0.01, -1, -1], [x + 0.01, y - armhole, 1]]]
+    places += [[[-1, y - 0.01, -1], [-neck, y + 0.01, 1]], [[neck, y - 0.01, -1], [1, y + 0.01, 1]]]
+    seams = [{"bodies": ("front", "back"), "within": 0.3, "select": {"box": place}, "duration": 0.4} for place in places]
+    turn = {"keyframes": [{"time": 0.5}, {"time": 1.2, "rotation": (0, 60, 0)}], "smooth": True, "center": (0, 0, 0)}
+    skin = {"motion": turn, "look": {"color": "#d8c4b2"}}
+    trunk = {"shape": "capsule", "radius": 0.1, "length": 0.4, "cells": (10, 10)}
+    shoulders = {"shape": "capsule", "radius": 0.045, "length": 0.3, "cells": (8, 10)}
+    obstacles = [
+        {"name": "trunk", "mesh": trunk, "translation": (0, -0.06, 0), **skin},
+        {"name": "shoulders", "mesh": shoulders, "rotation": (0, 0, 90), "translation": (0, 0.12, 0), **skin},
+        {"name": "neck", "mesh": {"shape": "capsule", "radius": 0.04, "length": 0.2}, "translation": (0, 0.24, 0), **skin},
+    ]
+    contact = {"activation_distance": 2e-3, "friction": 0.3}
+    return pdipc.Scene(bodies=bodies, obstacles=obstacles, stitches=seams, contact=contact, simulation={"steps": 130})
+
+
+def strips() -> pdipc.Scene:
+    """Three strips of one cloth, cut along its warp, at 45 degrees and along its weft, hang over an edge."""
+    cloth = {"areal_density": 0.2, "membrane_stiffness": 300.0, "bending_stiffness": 1.2e-4, "weft_bending_stiffness": 1.5e-5}
+    mesh = {"shape": "grid", "size": (0.11, 0.02), "cells": (28, 5)}
+    bodies = []
+    for k, (name, warp) in enumerate((("warp", (1, 0, 0)), ("bias", (1, 0, 1)), ("weft", (0, 0, 1)))):
+        strip = {"name": name, "kind": "cloth", "mesh": mesh, "translation": (0, 0, 0.04 * (k - 1))}
+        held = [{"select": {"box": [[-1, -1, -1], [-0.0175, 1, 1]]}}]
+        strip |= {"material": {**cloth, "warp": warp}, "pins": held, "look": {"color": ("#b04030", "#c89030", "#3060b0")[k]}}
+        bodies.append(strip)
+    table = {"name": "table", "mesh": {"shape": "box", "size": (0.06, 0.08, 0.16), "cells": (1, 1, 1)}}
+    table |= {"translation": (-0.05, -0.0405, 0), "look": {"color": "#b0b0b0"}}
+    simulation = {"time_step": 0.02, "steps": 100, "damping": 2.0}
+    return pdipc.Scene(bodies=bodies, obstacles=[table], simulation=simulation, contact={"activation_distance": 4e-4})
+
+
 # Which frames, from which side.
 PICTURES = {
     "knot": (knot, (0, 70, 110), (0.1, 0.3, 1.0)),
     "rope_ladder": (ladder, (0, 80, 130), (0.9, 0.25, 0.8)),
     "chain": (chain, (0, 45, 110), (0.3, 0.2, 1.0)),
     "all_kinds": (everything, (0, 25, 50), (0.7, 0.4, 1.0)),
+    "sleeve": (sleeve, (0, 40, 150), (0.4, 0.3, 1.0)),
+    "pillows": (pillows, (0, 30, 90), (0.5, 0.35, 1.0)),
+    "tunic": (tunic, (0, 50, 130), (0.4, 0.3, 1.0)),
+    "strips": (strips, (100,), (0.6, 0.1, 1.0)),
 }
 
 
@@ -146,11 +234,13 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.names:
         made, frames, view = PICTURES[name]
-        figure, axes = plt.subplots(1, len(frames), figsize=(6.4 * len(frames), 4.8), layout="constrained")
+        figure, axes = plt.subplots(1, len(frames), figsize=(6.4 * len(frames), 4.8), layout="constrained", squeeze=False)
         with tempfile.TemporaryDirectory() as folder:
+            spent = time.process_time()
             pdipc.run_scene(made(), f"{folder}/run", device="cpu")
+            spent = time.process_time() - spent
             run = pdipc.open_run(f"{folder}/run")
-            for frame, axis in zip(frames, axes, strict=True):
+            for frame, axis in zip(frames, axes[0], strict=True):
                 render(run, frame, f"{folder}/{frame}.png", Picture(size=(960, 720), view=view))
                 axis.imshow(_cropped(plt.imread(f"{folder}/{frame}.png")))
                 axis.set(xticks=[], yticks=[], frame_on=False)
@@ -158,8 +248,14 @@ def main() -> None:
                 len(pdipc.find_intersections(run.positions(k), run.triangles, run.obstacle)) for k in range(run.frame_count)
             )
             loose = sum(not record["converged"] for record in run.stats)
-            time = sum(sum(record["milliseconds"].values()) for record in run.stats) / len(run.stats)
-            print(f"{name}: {met} intersections, {loose} unconverged steps, {time:.0f} ms a step")
+            steps = len(run.stats)
+            wall = sum(sum(record["milliseconds"].values()) for record in run.stats) / steps
+            outer = sum(record["outer"] for record in run.stats) / steps
+            print(
+                f"{name}: {steps} steps, {met} intersections, {loose} unconverged steps, {outer:.1f} outer iterations, {wall:.0f} ms "
+                f"and {1e3 * spent / steps:.0f} ms of CPU a step",
+                flush=True,
+            )
         figure.savefig(options.output / f"{name}.png", dpi=60)
 
 

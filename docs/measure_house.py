@@ -1,8 +1,7 @@
 """Sizes of the package: `python docs/measure_house.py [FOLDER]` prints a table and lists what is long or takes many arguments.
 
 A function's lines are its own, without those of functions inside it. What is long or takes many arguments says why in a comment above it
-that begins with `# Long:` or `# Arguments:`; `tests/test_house.py` asks for it. Kernels are exempt from the second: each argument is an
-array that the kernel reads or, named `..._out`, writes.
+that begins with `# Long:` or `# Arguments:`; `tests/test_house.py` asks for it, of kernels, too.
 """
 
 import ast
@@ -17,12 +16,13 @@ LONG, MANY = 80, 10
 
 @dataclass(frozen=True)
 class Function:
-    """One function: where it is, its own lines, how many arguments it takes beside self, and why it may be long or take many."""
+    """One function: where it is, its own lines, how many arguments it takes beside self, what Warp makes of it, and why it may be long or take many."""
 
     name: str
     lines: int
     arguments: int
     is_kernel: bool
+    is_called_by_kernels: bool
     reasons: str
 
     @property
@@ -31,7 +31,7 @@ class Function:
 
     @property
     def takes_many(self) -> bool:
-        return self.arguments > MANY and not self.is_kernel
+        return self.arguments > MANY
 
 
 def functions(folder: Path = PACKAGE) -> Iterator[Function]:
@@ -57,7 +57,8 @@ def _inside(node: ast.AST, name: str, text: list[str]) -> Iterator[Function]:
                 _lines(child) - sum(map(_lines, outermost)),
                 len(taken) - (taken[:1] == ["self"]),
                 # decorators that make kernels, and functions whose code is generated
-                any(each.startswith(("wp.kernel", "kernel(", "language.func_native")) for each in decorators),
+                any(each.startswith(("wp.kernel", "kernel(", "language.func_native", "wp.func_native")) for each in decorators),
+                any(each in ("func", "wp.func") for each in decorators),
                 "\n".join(text[above + 1 : begins - 1]),
             )
             yield from _inside(child, f"{name}:{child.name}", text)
@@ -86,6 +87,12 @@ def main(folder: Path) -> None:
         "kernels": len(kernels),
         f"kernels with more than {MANY} arguments": sum(each.arguments > MANY for each in kernels),
         "most arguments of a kernel": max(each.arguments for each in kernels),
+        "functions of modules that kernels call": sum(
+            each.is_called_by_kernels and each.name.count(":") == 1 for each in found
+        ),
+        "functions in factories that kernels call": sum(
+            each.is_called_by_kernels and each.name.count(":") > 1 for each in found
+        ),
     }
     for name, value in rows.items():
         print(f"| {name} | {value} |")

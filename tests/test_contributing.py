@@ -34,8 +34,8 @@ def test_a_constraint_kind(monkeypatch):
     monkeypatch.setattr(projector, "KINDS", (*constraints.KINDS, mine))
     elasticity = cloth.elasticity
 
-    def with_mine(assembly, body):
-        sets, mass = elasticity(assembly, body)
+    def with_mine(assembly, body, newton):
+        sets, mass = elasticity(assembly, body, newton)
         return [dataclasses.replace(s, kind="mine") if s.kind == "edge_length" else s for s in sets], mass
 
     monkeypatch.setattr(cloth, "elasticity", with_mine)

@@ -24,3 +24,9 @@ def test_algorithm_1_fits_on_a_page():
 def test_what_is_large_says_why(what, reason):
     silent = [each.name for each in functions() if getattr(each, what) and reason not in each.reasons]
     assert not silent
+
+
+@pytest.mark.parametrize(("what", "reason"), [("is_long", "# Long:"), ("takes_many", "# Arguments:")])
+def test_no_reason_is_left_of_what_was_large(what, reason):
+    stale = [each.name for each in functions() if reason in each.reasons and not getattr(each, what)]
+    assert not stale

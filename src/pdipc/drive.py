@@ -27,7 +27,7 @@ class StepResult:
     the error of the step; in the paper's mode the norm of the truncated motion of all vertices.
     force_residual: N, the largest force on a free vertex that was left at the start of the last outer iteration, and force_scale, N, the
     largest force of inertia to compare it with; 0 for other methods than Newton's.
-    lag: m, how far something scripted is behind where it should be. searches: outer iterations that were turned back because
+    lag: m, how far what is furthest behind its script or command is behind where it should be; message names it. searches: outer iterations that were turned back because
     the potential rose. chords: in how many straight pieces what turns was led, at most. forces: of contact, where `Simulation.step` was asked for them. quarantined: bodies that
     ignored each other in this step. smallest_gap: m beyond the minimum separation, inf without contact. milliseconds: solver, ccd (culling and
     CCD), barrier, misc.
@@ -124,8 +124,7 @@ def _result(model: Model, state: State, work: Work, report: list[float], into: S
     """What the step came to, and its new state."""
     s, code, outer = model.settings, int(report[status.STATUS]), int(report[status.OUTER])
     time, number = state.time + s.time_step, state.step + 1
-    reached, lag, why = work.script.settle(time, state.reached, report[FIRST_NUMBER + status.LAG], work.x)
-    behind = f"something scripted is {lag:.3g} m behind its target, {why}" if lag > 0.0 else ""
+    reached, lag, behind = work.script.settle(time, state.reached, report[FIRST_NUMBER + status.LAG], work.x)
     message = {
         status.CONVERGED: behind,
         status.LAGGING: behind,

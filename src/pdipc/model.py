@@ -342,7 +342,7 @@ def _per_vertex(scene: Scene, assembly: Assembly, mass: np.ndarray, free: np.nda
             typical = mass[own].sum() / body.count if len(body.handles) else mass[own].mean()
             found["kappa"][own] = scene.contact.stiffness_scale * typical / (h * h)
             found["body_mass"][own] = mass[own].sum()
-            crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / speed_of_sound(body.material)
+            crossing = np.ptp(assembly.rest_positions[own], axis=0).max() / speed_of_sound(body)
             found["rigidity"][own] = h**2 / (h**2 + crossing**2)
     found["kappa"][~free] = found["body_mass"][~free] = 0.0
     return found

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Generator
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -29,12 +30,13 @@ METHODS = {"newton": Newton, "local-global": LocalGlobal, "printed": Printed}
 class Work:
     """What a step works with. Arrays over all n vertices, on the device:
 
-    x_start, rest, v_start, a_start: where the step starts, m, m/s, m/s^2; rest is what rounding took off x_start.
+    x_start, rest, v_start, a_start: where the step starts, m, m/s, m/s^2; rest is what rounding took off x_start. begin: all of it as
+    kernels take it.
     script: where kinematic vertices go. loads: external accelerations. z: the inertial displacement of line 1, m.
     u, x: the feasible iterate as displacement from x_start, with rest, and as position x = x_start + u, m. u_tilde, x_tilde: where the
     outer iteration wants to go. v, a: the result.
 
-    count, going, clock: see `nonlinear.status`. method: how the step is solved. generation: changes when arrays were replaced.
+    count, going, clock: see `integration.status`. method: how the step is solved. generation: changes when arrays were replaced.
     recorded: whether steps run as recorded graphs; without, each kernel is launched from Python, with the same bits. So it
     is for a solver that the host drives, and, with a warning, on a CUDA driver that has no loops in graphs.
     """
@@ -58,6 +60,8 @@ class Work:
         self.loads = Loads(device, real, model.external)
         self.count, self.going, self.foreign = zeros(wp.int32, status.COUNTS), zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.clock = zeros(wp.float64, len(status.STAGES) + 2)
+        self.begin = inertia.start(real)()
+        self.begin.x, self.begin.rest, self.begin.v, self.begin.a = self.x_start, self.rest, self.v_start, self.a_start
         self.report = zeros(wp.float64, inertia.SIZE)
         self.h = real.scalar(settings.time_step)
         self.candidates = Candidates(
@@ -146,14 +150,32 @@ class Work:
             if not self.grow():
                 return
 
+    # What methods hand to kernels.
+
+    def progress(self) -> Any:
+        """How the step stands."""
+        made = status.progress(self.model.real)()
+        made.count, made.numbers, made.clock, made.going = self.count, self.method.numbers, self.clock, self.going
+        return made
+
+    def inertial(self) -> Any:
+        """What the potential of inertia and damping takes."""
+        model, real, made = self.model, self.model.real, inertia.inertial(self.model.real)()
+        made.rest, made.z, made.mass, made.free = self.rest, self.z, model.mass, model.free
+        made.h, made.damping = self.h, real.scalar(model.settings.damping)
+        return made
+
+    def led(self) -> Any:
+        """The vertices as displaced so far, and where those go that follow a script."""
+        return self.script.led(self.x_start, self.u, self.model.free)
+
     # What Algorithm 1 is made of, in launches only.
 
     def start_clock(self) -> None:
         """Times and counts of the step begin."""
         device, k = self.device, self.kernels
         device.launch_serial(k.start_clock, [*system.clock_call(), self.clock])
-        counts = [self.count, self.method.inner, self.method.iterations, self.method.numbers, self.going]
-        device.launch_serial(k.begin, counts)
+        device.launch_serial(k.begin, [self.progress(), self.method.inner, self.method.iterations])
 
     def mark(self, stage: str) -> None:
         """The time since the last mark belongs to `stage`."""
@@ -163,16 +185,8 @@ class Work:
         """Lines 1 and 2: z and x~, as displacements."""
         self.device.copy(self.x, self.x_start)
         self.script.begin(self.x_start)
-        start = [
-            self.x_start,
-            self.rest,
-            self.v_start,
-            self.a_start,
-            self.loads.acceleration,
-            self.script.target,
-            self.model.free,
-        ]
-        self.device.launch(self.kernels.predict, self.model.vertex_count, [*start, self.h, self.u, self.z, self.u_tilde])
+        inputs = [self.begin, self.loads.acceleration, self.script.target, self.model.free, self.h]
+        self.device.launch(self.kernels.predict, self.model.vertex_count, [*inputs, self.u, self.z, self.u_tilde])
 
     def rebound(self) -> None:
         """With restitution, velocities are those that bodies part with; the motion behind them is made in `restitution.u_now`."""
@@ -193,11 +207,11 @@ class Work:
     def part(self) -> None:
         """Line 18."""
         moved = self.u if self.restitution is None else self.restitution.u_now
-        inputs = [self.x_start, self.rest, self.u, moved, self.x, self.model.free, self.h, self.v_start, self.a_start]
+        inputs = [self.begin, self.u, moved, self.x, self.model.free, self.h]
         self.device.launch(self.kernels.finish, self.model.vertex_count, [*inputs, self.rest_end, self.v, self.a])
 
     def write_report(self) -> None:
         """What the host reads when the step is over."""
         m = self.method
-        numbers = [self.count, m.inner, m.iterations, m.numbers, m.pairs.closest, self.foreign, self.script.chords, self.clock]
+        numbers = [self.progress(), m.inner, m.iterations, m.pairs.closest, self.foreign, self.script.chords]
         self.device.launch_serial(self.kernels.report, [*numbers, self.report])

@@ -80,7 +80,7 @@ def test_a_pose_inside_a_body_that_cannot_give_way_is_held_and_reported():
     for _ in range(12):
         result = simulation.step()
     assert result.lag > 0.0
-    assert "behind its target, where something is in its way" in result.message
+    assert f'obstacle "tool" is {result.lag:.3g} m behind its target, where something is in its way' in result.message
     assert 0.075 < simulation.pose("tool")[0][1] < 0.076
     assert fastest(simulation) == 0.0 if simulation.model.free_vertices.any() else True
 

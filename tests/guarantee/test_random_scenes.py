@@ -18,7 +18,6 @@ from pdipc.simulation import run_scene
 
 STEPS = 3
 PARTS, OF_A_PART = 8, 25  # random scenes
-UNCONVERGED = 4  # steps of the 75 of a part, at most
 OF_TRUE = 30  # scenes whose steps are solved again
 CUT, OF_CUT = 2, 20  # outer iterations after which steps are cut short, and scenes
 
@@ -88,7 +87,6 @@ def examples(count: int, number: int):
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_steps_converge_and_nothing_intersects_at_any_outer_iteration(part):
-    """A few steps need more than the cap of outer iterations, such as those of a sheet at 20 m/s that spins, and say so."""
     results = []
 
     @examples(OF_A_PART, part)
@@ -97,9 +95,8 @@ def test_steps_converge_and_nothing_intersects_at_any_outer_iteration(part):
         results.extend(judged(random_scene))
 
     holds()
-    capped = [result.message for result in results if not result.converged]
-    assert len(capped) <= UNCONVERGED
-    assert all("outer iterations ended the step" in message for message in capped)
+    assert len(results) > 2 * OF_A_PART
+    assert not [result.message for result in results if not result.converged]
 
 
 def test_steps_that_converge_are_solved():

@@ -71,6 +71,21 @@ def test_what_spins_by_more_than_a_radian_a_step_is_not_stretched_by_it(young):
     assert max(result.outer for result in results) <= 10
 
 
+@pytest.mark.parametrize("young", [1e6, 1e9, 2e11])
+def test_what_is_hinged_turns_about_its_hinge(young):
+    """A door of steel once took 110 outer iterations a step: straight ones, of which each stretched it."""
+    pins = [{"select": {"box": ((-0.21, -0.02, -0.11), (-0.19, 0.0, 0.11))}}]  # vertices on a line
+    spin = {"angular_velocity": (0.0, 0.0, 100.0), "velocity": (0.0, 20.0, 0.0)}
+    door = solid("door", (0.4, 0.02, 0.2), (8, 1, 4), young=young, poisson=0.3, pins=pins, **spin)
+    simulation = pdipc.Simulation(scene([door], time_step=0.01), "cpu")
+    assert (~simulation.model.free_vertices).sum() == 5
+    results = [simulation.step() for _ in range(8)]
+    assert all(result.converged for result in results)
+    assert max(result.outer for result in results) <= 10
+    extents = simulation.positions[:, 2].max() - simulation.positions[:, 2].min()
+    assert extents == pytest.approx(0.2, rel=1e-2)
+
+
 @pytest.mark.parametrize("speed", [1.0, 8.0])
 def test_a_plate_pushes_what_is_in_its_way(speed):
     """By ten times d_hat a step and by eighty: the iterations of a step do not count how often d_hat fits into its way."""

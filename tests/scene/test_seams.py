@@ -64,6 +64,24 @@ def test_seams_are_opened_by_the_gap_and_sewn_again():
     assert len(length) >= 10 and length.max() < 8e-4  # the bent panels pull
 
 
+def test_seams_that_lie_on_each_other_are_left_before_triangles_fold():
+    """Two panels on each other, drawn back the same way: they never part, and no triangle loses more than a good half of its height."""
+    grid = np.stack([*np.meshgrid(np.linspace(0, 0.1, 6), np.linspace(0, 0.1, 6), indexing="ij"), np.zeros((6, 6))], axis=-1)
+    points = np.concatenate([grid.reshape(-1, 3)] * 2)
+    c = (np.arange(6)[:-1, None] * 6 + np.arange(5)).ravel()
+    triangles = np.concatenate([np.stack([c, c + 6, c + 7], 1), np.stack([c, c + 7, c + 1], 1)])
+    triangles = np.concatenate([triangles, triangles + 36])
+    moved = seams.opened(points, triangles, 2e-3)
+    assert np.linalg.norm(moved - points, axis=1).max() < 0.01
+
+    def areas(x):
+        return np.linalg.norm(
+            np.cross(x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]), axis=1
+        )
+
+    assert (areas(moved) / areas(points)).min() > 0.4
+
+
 def test_what_would_fold_up_is_refused():
     with pytest.raises(pdipc.SceneError, match=r'body "tube", weld: 0.09 m would fold \d+ triangles up'):
         assemble(garment(weld=0.09))

@@ -275,38 +275,27 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
+        o: Hessian,
         free: wp.array(dtype=scalar),
         energy: wp.array(dtype=wp.float64),
         slope: wp.array(dtype=mat43),
-        lever: wp.array(dtype=mat43),
-        hessian: wp.array(dtype=scalar),
         force_out: wp.array(dtype=vec3),
         diagonal_out: wp.array(dtype=mat33),
         energy_out: wp.array(dtype=wp.float64),
     ):
         """Of each vertex: the force, the block of the Hessian, and the energy of the pairs whose first free vertex it is."""
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         force = vec3()
         d = mat33()
         own = wp.float64(0.0)
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            s = entries[i] % 4
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            s = o.entries[i] % 4
             force -= row(slope[k], s)
-            j = row(lever[k], s)
-            d += hessian[k] * wp.outer(j, j)
-            if free[v] > zero:
-                before = zero
-                for t in range(4):
-                    if t < s:
-                        before += free[quads[k][t]]
-                if before == zero:
+            j = row(o.lever[k], s)
+            d += o.hessian[k] * wp.outer(j, j)
+            if free[v] > zero:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                if pairs.counts_here(o.quads[k], s, free):
                     own += energy[k]
         force_out[v] = force
         diagonal_out[v] = d
@@ -428,8 +417,13 @@ class BarrierTerm(ActivePairs):
         result = [self.energy_of_pair, self.slope, self.lever, self.hessian]
         bent = [self.bend, self.first_bent, self.second_bent]
         device.launch_list(k.differentiate, self.capacity, [self.frozen, x, *result, *bent])
-        inputs = [self.ends, self.entries, self.quads, self.free, *result]
-        device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
+        self.gather_pairs()
+
+    def gather_pairs(self) -> None:
+        """Launches what the pairs give each vertex: force, block of the Hessian, energy."""
+        result = [self.force_of_vertex, self.diagonal, self.energy_of_vertex]
+        inputs = [self.operand(), self.free, self.energy_of_pair, self.slope, *result]
+        self.device.launch(self.exact.gather, len(self.ends), inputs)
 
     def pushed(self) -> Exerted:
         """The barrier's forces where it was last differentiated, and what restitution added. Not recordable."""
@@ -455,11 +449,10 @@ class BarrierTerm(ActivePairs):
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
-        inputs = [self.ends, self.entries, self.quads, self.lever, self.hessian]
         if modes.wide:
-            modes.couple(wide_coupling(self.real), self.count, self.capacity, inputs)
+            modes.couple(wide_coupling(self.real), self.operand(), self.capacity)
         else:
-            self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+            self.device.launch(coupling(self.real), modes.groups, [modes.layout, self.operand(), modes.c], grain=64)
 
     def operand(self):
         """What the functions of `operator` work on."""
@@ -514,17 +507,17 @@ def wide_coupling(real: Real) -> Kernel:
     """`coupling` with a block of threads a pair of groups."""
     from pdipc.linear import wide_modes
 
-    scalar, mat43, wide = real.scalar, kernels(real).mat43, wp.float64
+    Hessian, wide = hessian_of(real), wp.float64
 
     @func
-    def block_of(k: int, s: int, t: int, lever: wp.array(dtype=mat43), hessian: wp.array(dtype=scalar)) -> wp.mat33d:
-        a = row(lever[k], s)
-        b = row(lever[k], t)
-        return wide(hessian[k]) * wp.outer(
+    def block_of(o: Hessian, k: int, s: int, t: int) -> wp.mat33d:
+        a = row(o.lever[k], s)
+        b = row(o.lever[k], t)
+        return wide(o.hessian[k]) * wp.outer(
             wp.vec3d(wide(a[0]), wide(a[1]), wide(a[2])), wp.vec3d(wide(b[0]), wide(b[1]), wide(b[2]))
         )
 
-    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), block_of, mat43, scalar)
+    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), Hessian, block_of)
 
 
 @functools.cache
@@ -532,46 +525,28 @@ def coupling(real: Real) -> Kernel:
     """The kernel that adds rank-one terms of pairs to the matrix of rigid modes, a group of vertices a worker."""
     from pdipc.linear import rigid_modes
 
-    scalar, vec3 = real.scalar, real.vec3
-    f, mat43 = rigid_modes.functions(real), kernels(real).mat43
+    f, Layout, Hessian = rigid_modes.functions(real), rigid_modes.layout_of(real), hessian_of(real)
 
     @kernel(real.module(f"{__name__}.coupling"))
-    def couple(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.int32),
-        groups: int,
-        arms: wp.array(dtype=vec3),
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        lever: wp.array(dtype=mat43),
-        hessian: wp.array(dtype=scalar),
-        c: wp.array(dtype=wp.float64),
-    ):
+    def couple(first: int, of: Layout, o: Hessian, c: wp.array(dtype=wp.float64)):
         g = first + wp.tid()
-        size = rigid_modes.MODES * groups
-        for m in range(starts[g], starts[g + 1]):
-            v = members[m]
-            begin = int(0)
-            if v > 0:
-                begin = ends[v - 1]
-            for e in range(begin, ends[v]):
-                k = entries[e] // 4
-                s = entries[e] % 4
-                h = wp.float64(hessian[k])
-                own = f.mode(arms[v], row(lever[k], s))
+        size = rigid_modes.MODES * of.groups
+        for m in range(of.starts[g], of.starts[g + 1]):
+            v = of.members[m]
+            for e in range(first_entry(v, o.ends), o.ends[v]):
+                k = o.entries[e] // 4
+                s = o.entries[e] % 4
+                h = wp.float64(o.hessian[k])
+                own = f.mode(of.arms[v], row(o.lever[k], s))
                 for t in range(4):
-                    i = quads[k][t]
-                    other = label[i]
+                    i = o.quads[k][t]
+                    other = of.label[i]
                     if other >= 0 and other <= g:
-                        far = f.mode(arms[i], row(lever[k], t))
-                        if other >= low[g]:
+                        far = f.mode(of.arms[i], row(o.lever[k], t))
+                        if other >= of.low[g]:
                             f.add_outer(c, size, g, other, h, own, far)
                     # a partner outside of the profile, on either side, is bounded by the diagonals
-                    if other >= 0 and (other < low[g] or g < low[wp.max(other, 0)]):
+                    if other >= 0 and (other < of.low[g] or g < of.low[wp.max(other, 0)]):
                         f.add_outer(c, size, g, g, h, own, own)
 
     return couple

@@ -112,10 +112,8 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def evaluate(
         span: Span,
-        count: wp.array(dtype=wp.int32),
+        o: Hessian,
         u: wp.array(dtype=vec3),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
         normals: wp.array(dtype=vec3),
         limit: wp.array(dtype=scalar),
         threshold: scalar,
@@ -126,10 +124,10 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Energy, J; the force per unit of witness weight, N; and the block of the Hessian, N/m."""
         worker = span.first + wp.tid()
-        for b in range(worker * span.block, count[0], span.step * span.block):
-            for k in range(b, wp.min(b + span.block, count[0])):
+        for b in range(worker * span.block, o.count[0], span.step * span.block):
+            for k in range(b, wp.min(b + span.block, o.count[0])):
                 n = normals[k]
-                s = slip(quads[k], weights[k], n, u)
+                s = slip(o.quads[k], o.weights[k], n, u)
                 size = wp.length(s)
                 rate = limit[k] * barrier.smoothed_coulomb(size, threshold)
                 length, rising = dissipation(size, threshold)
@@ -147,37 +145,26 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
+        o: Hessian,
         free: wp.array(dtype=scalar),
         energy: wp.array(dtype=wp.float64),
         force: wp.array(dtype=vec3),
-        block: wp.array(dtype=mat33),
         force_out: wp.array(dtype=vec3),
         diagonal_out: wp.array(dtype=mat33),
         energy_out: wp.array(dtype=wp.float64),
     ):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         total = vec3()
         d = mat33()
         own = wp.float64(0.0)
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            s = entries[i] % 4
-            a = weights[k][s]
+        for i in range(first_entry(v, o.ends), o.ends[v]):
+            k = o.entries[i] // 4
+            s = o.entries[i] % 4
+            a = o.weights[k][s]
             total += a * force[k]
-            d += (a * a) * block[k]
-            if free[v] > zero:
-                before = zero
-                for t in range(4):
-                    if t < s:
-                        before += free[quads[k][t]]
-                if before == zero:
+            d += (a * a) * o.block[k]
+            if free[v] > zero:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                if pairs.counts_here(o.quads[k], s, free):
                     own += energy[k]
         force_out[v] = total
         diagonal_out[v] = d
@@ -275,10 +262,10 @@ class FrictionTerm:
         is to be a bound that never overshoots.
         """
         k, device = self.kernels, self.device
-        inputs = [self.count, u, self.quads, self.weights, self.normals, self.limit, self.threshold, project]
-        result = [self.energy_of_pair, self.force, self.block]
-        device.launch_list(k.evaluate, self.capacity, [*inputs, *result])
-        inputs = [self.ends, self.entries, self.quads, self.weights, self.source.free, *result]
+        o = self.operand()
+        inputs = [o, u, self.normals, self.limit, self.threshold, project]
+        device.launch_list(k.evaluate, self.capacity, [*inputs, self.energy_of_pair, self.force, self.block])
+        inputs = [o, self.source.free, self.energy_of_pair, self.force]
         device.launch(k.gather, len(self.ends), [*inputs, self.force_of_vertex, self.diagonal, self.energy_of_vertex])
 
     def rubbed(self) -> Exerted:
@@ -300,11 +287,10 @@ class FrictionTerm:
 
     def couple(self, modes) -> None:
         """Adds the Hessian to the matrix of the rigid modes. Recordable."""
-        inputs = [self.ends, self.entries, self.quads, self.weights, self.block]
         if modes.wide:
-            modes.couple(wide_coupling(self.real), self.count, self.capacity, inputs)
+            modes.couple(wide_coupling(self.real), self.operand(), self.capacity)
         else:
-            self.device.launch(coupling(self.real), modes.groups, [*modes.layout, *inputs, modes.c], grain=64)
+            self.device.launch(coupling(self.real), modes.groups, [modes.layout, self.operand(), modes.c], grain=64)
 
     def operand(self):
         """What the functions of `operator` work on."""
@@ -348,14 +334,13 @@ def wide_coupling(real: Real) -> Kernel:
     """`coupling` with a block of threads a pair of groups."""
     from pdipc.linear import wide_modes
 
-    vec4, mat33 = real.vec4, real.mat33
-    wide, widened = wp.float64, wide_modes.functions(real).widened
+    Hessian, wide, widened = hessian_of(real), wp.float64, wide_modes.functions(real).widened
 
     @func
-    def block_of(k: int, s: int, t: int, weights: wp.array(dtype=vec4), block: wp.array(dtype=mat33)) -> wp.mat33d:
-        return (wide(weights[k][s]) * wide(weights[k][t])) * widened(block[k])
+    def block_of(o: Hessian, k: int, s: int, t: int) -> wp.mat33d:
+        return (wide(o.weights[k][s]) * wide(o.weights[k][t])) * widened(o.block[k])
 
-    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), block_of, vec4, mat33)
+    return wide_modes.coupling(real, real.module(f"{__name__}.wide_coupling"), Hessian, block_of)
 
 
 @functools.cache
@@ -363,50 +348,33 @@ def coupling(real: Real) -> Kernel:
     """As in `exact`, for terms of rank two."""
     from pdipc.linear import rigid_modes
 
-    scalar, vec3, vec4, mat33 = real.scalar, real.vec3, real.vec4, real.mat33
+    scalar, vec3, Layout, Hessian = real.scalar, real.vec3, rigid_modes.layout_of(real), hessian_of(real)
     f = rigid_modes.functions(real)
 
     @kernel(real.module(f"{__name__}.coupling"))
-    def couple(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.int32),
-        groups: int,
-        arms: wp.array(dtype=vec3),
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        weights: wp.array(dtype=vec4),
-        block: wp.array(dtype=mat33),
-        c: wp.array(dtype=wp.float64),
-    ):
+    def couple(first: int, of: Layout, o: Hessian, c: wp.array(dtype=wp.float64)):
         g = first + wp.tid()
-        size = rigid_modes.MODES * groups
+        size = rigid_modes.MODES * of.groups
         one = wp.float64(1.0)
-        for m in range(starts[g], starts[g + 1]):
-            v = members[m]
-            begin = int(0)
-            if v > 0:
-                begin = ends[v - 1]
-            for e in range(begin, ends[v]):
-                k = entries[e] // 4
-                a = weights[k][entries[e] % 4]
-                b = block[k]
+        for m in range(of.starts[g], of.starts[g + 1]):
+            v = of.members[m]
+            for e in range(first_entry(v, o.ends), o.ends[v]):
+                k = o.entries[e] // 4
+                a = o.weights[k][o.entries[e] % 4]
+                b = o.block[k]
                 for t in range(4):
-                    i = quads[k][t]
-                    other = label[i]
-                    outside = other >= 0 and (other < low[g] or g < low[wp.max(other, 0)])
+                    i = o.quads[k][t]
+                    other = of.label[i]
+                    outside = other >= 0 and (other < of.low[g] or g < of.low[wp.max(other, 0)])
                     for axis in range(3):
                         # block = sum over axes of its column times the unit vector
                         unit = vec3()
                         unit[axis] = scalar(1.0)
                         column = vec3(b[0, axis], b[1, axis], b[2, axis])
-                        own = f.mode(arms[v], a * column)
-                        if other >= low[g] and other <= g:
-                            f.add_outer(c, size, g, other, one, own, f.mode(arms[i], weights[k][t] * unit))
+                        own = f.mode(of.arms[v], a * column)
+                        if other >= of.low[g] and other <= g:
+                            f.add_outer(c, size, g, other, one, own, f.mode(of.arms[i], o.weights[k][t] * unit))
                         if outside:
-                            f.add_outer(c, size, g, g, one, own, f.mode(arms[v], a * unit))
+                            f.add_outer(c, size, g, g, one, own, f.mode(of.arms[v], a * unit))
 
     return couple

@@ -24,9 +24,11 @@ import warp as wp
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
 from pdipc.collision.candidates import SILENT, Candidates
+from pdipc.collision.candidates import listed as candidates_of
 from pdipc.device.language import Function, filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
+from pdipc.linear.contact_rows import first_entry
 
 FIRST_PAIRS = 1024  # room at first
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
@@ -47,6 +49,8 @@ def frozen(real: Real) -> Any:
         activation=wp.array(dtype=scalar),  # d_hat, m
         stiffness=wp.array(dtype=scalar),  # kappa m, N/m
         coefficient=wp.array(dtype=scalar),  # of friction
+        ends=wp.array(dtype=wp.int32),  # of each vertex, where its pairs end in
+        entries=wp.array(dtype=wp.int32),  # 4 pair + place
     )
 
 
@@ -61,9 +65,19 @@ def pair_stiffness(a: Scalar, b: Scalar, mollifier: Scalar):
     return mollifier * type(a)(0.5) * (a + b)
 
 
+@func
+def counts_here(q: wp.vec4i, s: int, free: wp.array(dtype=Scalar)) -> bool:
+    """Whether vertex s of a pair is the first that is free: with it the pair's energy is counted."""
+    first = bool(True)
+    for t in range(4):
+        if t < s and free[q[t]] > type(free[0])(0.0):
+            first = False
+    return first
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    Frozen = frozen(real)
+    Frozen, Listed = frozen(real), candidates_of(real)
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     far = wp.constant(real.scalar(1.0e30))
@@ -116,11 +130,8 @@ def kernels(real: Real) -> SimpleNamespace:
         @kernel(module, f"measure_{kind}")
         def measure_gaps(
             span: Span,
-            count: wp.array(dtype=wp.int32),
+            c: Listed,
             x: wp.array(dtype=vec3),
-            quads: wp.array(dtype=wp.vec4i),
-            limits: wp.array(dtype=vec2),
-            faces: wp.array(dtype=wp.int32),
             ahead: wp.array(dtype=vec3),
             driven: wp.array(dtype=wp.int32),
             gaps_out: wp.array(dtype=scalar),
@@ -129,25 +140,25 @@ def kernels(real: Real) -> SimpleNamespace:
         ):
             """Gaps of the candidates; for each block how many are active, and the negative of the smallest gap of those."""
             worker = span.first + wp.tid()
-            for begin in range(worker * span.block, quads.shape[0], span.step * span.block):
+            for begin in range(worker * span.block, c.quads.shape[0], span.step * span.block):
                 active = int(0)
                 smallest = far
-                for k in range(begin, wp.min(begin + span.block, count[0])):
+                for k in range(begin, wp.min(begin + span.block, c.count[0])):
                     # CCD has proven it positive; measured in this precision it may round to less, of which there is no logarithm
                     gap = far
-                    if faces[k] != silent:
-                        gap = wp.max(gap_of(x, quads[k], limits[k]), least * limits[k][1])
+                    if c.faces[k] != silent:
+                        gap = wp.max(gap_of(x, c.quads[k], c.limits[k]), least * c.limits[k][1])
                         if ahead:
-                            q = quads[k]
+                            q = c.quads[k]
                             if driven[q[0]] + driven[q[1]] + driven[q[2]] + driven[q[3]] > 0:
                                 a = vec4()
                                 if wp.static(edge_edge):
                                     a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                                 else:
                                     a = vec4(distance.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                                gap = foreseen(gap, q, a, limits[k], x, ahead)
+                                gap = foreseen(gap, q, a, c.limits[k], x, ahead)
                     gaps_out[k] = gap
-                    if gap < limits[k][1]:
+                    if gap < c.limits[k][1]:
                         active += 1
                         smallest = wp.min(smallest, gap)
                 active_out[begin // span.block] = active
@@ -156,47 +167,33 @@ def kernels(real: Real) -> SimpleNamespace:
         return measure_gaps
 
     @func
-    def nearest_of_face(
-        k: int,
-        count: int,
-        quads: wp.array(dtype=wp.vec4i),
-        faces: wp.array(dtype=wp.int32),
-        gaps: wp.array(dtype=scalar),
-    ) -> bool:
+    def nearest_of_face(k: int, c: Listed) -> bool:
         """Whether no other triangle of its face is as near to the vertex of pair k, which has its pairs in a row; the first of equals is."""
         nearest = bool(True)
-        own = wp.abs(gaps[k])  # what is foreseen has a minus
-        if faces[k] >= 0:
+        own = wp.abs(c.gaps[k])  # what is foreseen has a minus
+        if c.faces[k] >= 0:
             for way in range(2):
                 step = 1 - 2 * way
                 j = k + step
-                while nearest and j >= 0 and j < count:
-                    if quads[j][0] != quads[k][0]:
-                        j = count
+                while nearest and j >= 0 and j < c.count[0]:
+                    if c.quads[j][0] != c.quads[k][0]:
+                        j = c.count[0]
                     else:
-                        other = wp.abs(gaps[j])
-                        if faces[j] == faces[k] and (other < own or (way == 1 and other == own)):
+                        other = wp.abs(c.gaps[j])
+                        if c.faces[j] == c.faces[k] and (other < own or (way == 1 and other == own)):
                             nearest = False
                         j += step
         return nearest
 
     @kernel(module)
-    def claim(
-        span: Span,
-        count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        limits: wp.array(dtype=vec2),
-        faces: wp.array(dtype=wp.int32),
-        gaps: wp.array(dtype=scalar),
-        active_out: wp.array(dtype=wp.int32),
-    ):
+    def claim(span: Span, c: Listed, active_out: wp.array(dtype=wp.int32)):
         """For each block how many are active, of a flat face one."""
         worker = span.first + wp.tid()
-        for begin in range(worker * span.block, quads.shape[0], span.step * span.block):
+        for begin in range(worker * span.block, c.quads.shape[0], span.step * span.block):
             active = int(0)
-            for k in range(begin, wp.min(begin + span.block, count[0])):
-                if gaps[k] < limits[k][1]:  # noqa: SIM102  (Warp evaluates both sides of an "and")
-                    if nearest_of_face(k, count[0], quads, faces, gaps):
+            for k in range(begin, wp.min(begin + span.block, c.count[0])):
+                if c.gaps[k] < c.limits[k][1]:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                    if nearest_of_face(k, c):
                         active += 1
             active_out[begin // span.block] = active
 
@@ -224,12 +221,8 @@ def kernels(real: Real) -> SimpleNamespace:
         @kernel(module, f"freeze_{kind}")
         def freeze_pairs(
             span: Span,
-            count: wp.array(dtype=wp.int32),
+            c: Listed,
             x: wp.array(dtype=vec3),
-            quads: wp.array(dtype=wp.vec4i),
-            limits: wp.array(dtype=vec2),
-            faces: wp.array(dtype=wp.int32),
-            gaps: wp.array(dtype=scalar),
             ends: wp.array(dtype=wp.int32),
             kappa: wp.array(dtype=scalar),
             friction: wp.array(dtype=scalar),
@@ -238,20 +231,20 @@ def kernels(real: Real) -> SimpleNamespace:
             share_out: wp.array(dtype=scalar),
         ):
             worker = span.first + wp.tid()
-            for begin in range(worker * span.block, count[0], span.step * span.block):
+            for begin in range(worker * span.block, c.count[0], span.step * span.block):
                 slot = int(0)
                 if begin > 0:
                     slot = ends[begin // span.block - 1]
                 if wp.static(edge_edge):
                     slot += pairs_out.count[2]
-                for k in range(begin, wp.min(begin + span.block, count[0])):
-                    d_hat = limits[k][1]
-                    acts = gaps[k] < d_hat and slot < pairs_out.quads.shape[0]
+                for k in range(begin, wp.min(begin + span.block, c.count[0])):
+                    d_hat = c.limits[k][1]
+                    acts = c.gaps[k] < d_hat and slot < pairs_out.quads.shape[0]
                     if wp.static(not edge_edge):  # noqa: SIM102  (known when the kernel is made)
                         if acts:
-                            acts = nearest_of_face(k, count[0], quads, faces, gaps)
+                            acts = nearest_of_face(k, c)
                     if acts:
-                        q = quads[k]
+                        q = c.quads[k]
                         p0 = x[q[0]]
                         p1 = x[q[1]] - p0
                         p2 = x[q[2]] - p0
@@ -266,7 +259,7 @@ def kernels(real: Real) -> SimpleNamespace:
                             a = vec4(distance.vertex_triangle_weights(zero, p1, p2, p3))
                         r = a[1] * p1 + a[2] * p2 + a[3] * p3
                         n = wp.normalize(r)
-                        d0 = gaps[k]
+                        d0 = c.gaps[k]
                         pairs_out.quads[slot] = q
                         pairs_out.weights[slot] = a
                         pairs_out.normals[slot] = n
@@ -328,9 +321,7 @@ def kernels(real: Real) -> SimpleNamespace:
             for k in range(b, wp.min(b + span.block, count[0])):
                 for s in range(4):
                     v = quads[k][s]
-                    low = int(0)
-                    if v > 0:
-                        low = ends[v - 1]
+                    low = first_entry(v, ends)
                     before = int(0)
                     for i in range(low, ends[v]):
                         if entries[i] < k * 4 + s:
@@ -381,8 +372,6 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
         pairs: Frozen,
         friction: wp.array(dtype=scalar),
         share: wp.array(dtype=scalar),
@@ -393,14 +382,12 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Adds the contact forces to the right-hand side and makes the block diagonal that dominates the contact Hessian."""
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
+        low = first_entry(v, pairs.ends)
         total = vec3()
         d = mat33()
-        for i in range(low, ends[v]):
-            k = entries[i] // 4
-            w = pairs.weights[k][entries[i] % 4]
+        for i in range(low, pairs.ends[v]):
+            k = pairs.entries[i] // 4
+            w = pairs.weights[k][pairs.entries[i] % 4]
             n = pairs.normals[k]
             total += w * force[k]
             scale = wp.abs(w) * share[k]
@@ -409,7 +396,7 @@ def kernels(real: Real) -> SimpleNamespace:
             d[0, 0] = d[0, 0] + f
             d[1, 1] = d[1, 1] + f
             d[2, 2] = d[2, 2] + f
-        if ends[v] > low:
+        if pairs.ends[v] > low:
             rhs[v] = rhs[v] + total
         diagonal_out[v] = d
 
@@ -432,22 +419,13 @@ def kernels(real: Real) -> SimpleNamespace:
                 response_out[k] = (hessian[k] - friction[k]) * wp.dot(n, u) * n + friction[k] * u
 
     @kernel(module)
-    def spread(
-        first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=vec4),
-        response: wp.array(dtype=vec3),
-        y: wp.array(dtype=vec3),
-    ):
+    def spread(first: int, pairs: Frozen, response: wp.array(dtype=vec3), y: wp.array(dtype=vec3)):
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
-        if ends[v] > low:
+        low = first_entry(v, pairs.ends)
+        if pairs.ends[v] > low:
             total = vec3()
-            for i in range(low, ends[v]):
-                total += weights[entries[i] // 4][entries[i] % 4] * response[entries[i] // 4]
+            for i in range(low, pairs.ends[v]):
+                total += pairs.weights[pairs.entries[i] // 4][pairs.entries[i] % 4] * response[pairs.entries[i] // 4]
             y[v] = y[v] + total
 
     @kernel(module)
@@ -487,11 +465,8 @@ def total_share(real: Real) -> Function:
 
     @func
     def total(v: int, ends: wp.array(dtype=wp.int32), shares: wp.array(dtype=vec3)) -> vec3:
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         total_of_vertex = vec3()
-        for i in range(low, ends[v]):
+        for i in range(first_entry(v, ends), ends[v]):
             total_of_vertex += shares[i]
         return total_of_vertex
 
@@ -537,11 +512,11 @@ class FrozenPairs:
         self.quads, self.weights, self.normals = make(wp.vec4i), make(real.vec4), make(real.vec3)
         self.gaps, self.activation, self.stiffness = make(real.scalar), make(real.scalar), make(real.scalar)
         self.coefficient, self.friction = make(real.scalar), make(real.scalar)
-        self.frozen = filled(frozen(real), self)
         self.share, self.hessian = make(real.scalar), make(real.scalar)
         self.force, self.response, self.energies = make(real.vec3), make(real.vec3), make(real.scalar)
         self.rebound = make(real.scalar)  # N: what restitution adds along the normal, see `Restitution.keep`
         self.entries = wp.zeros(4 * capacity, dtype=wp.int32, device=self.device.warp)
+        self.frozen = filled(frozen(real), self)
         wide = 4 * capacity if self.device.wide else 1
         self.unsorted, self.places = (wp.zeros(wide, dtype=wp.int32, device=self.device.warp) for _ in range(2))
         self.shares = wp.zeros(wide, dtype=real.vec3, device=self.device.warp)
@@ -558,17 +533,16 @@ class FrozenPairs:
         """
         k, device = self.kernels, self.device
         for slot, c in enumerate(candidates.lists):
-            inputs = [c.count, x, c.quads, c.limits, c.faces, ahead, driven, c.gaps, c.found, c.closest]
+            inputs = [c.listed, x, ahead, driven, c.gaps, c.found, c.closest]
             device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
             if candidates.surface.has_faces and slot == 0:
-                device.launch_list(k.claim, c.capacity, [c.count, c.quads, c.limits, c.faces, c.gaps, c.found])
+                device.launch_list(k.claim, c.capacity, [c.listed, c.found])
             device.scan(c.found, c.ends)
         candidates.largest.find([c.closest for c in candidates.lists], self.closest, [0, 1])
         ends = [c.ends for c in candidates.lists]
         device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
         for c in candidates.lists:
-            inputs = [c.count, x, c.quads, c.limits, c.faces, c.gaps, c.ends]
-            inputs += [self.kappa, self.friction_of_vertex, self.free, self.frozen, self.share]
+            inputs = [c.listed, x, c.ends, self.kappa, self.friction_of_vertex, self.free, self.frozen, self.share]
             device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
         self._index()
 
@@ -643,7 +617,7 @@ class ActivePairs(FrozenPairs):
 
     def gather(self, rhs: wp.array) -> None:
         """Adds the forces of the pairs to rhs, and makes the block diagonal that dominates their Hessian. Recordable."""
-        inputs = [self.ends, self.entries, self.frozen, self.friction, self.share, self.hessian, self.force]
+        inputs = [self.frozen, self.friction, self.share, self.hessian, self.force]
         self.device.launch(self.kernels.gather, len(self.ends), [*inputs, rhs, self.diagonal])
 
     def apply(self, p: wp.array, y: wp.array) -> None:
@@ -651,7 +625,7 @@ class ActivePairs(FrozenPairs):
         k = self.kernels
         inputs = [self.frozen, p, self.friction, self.hessian, self.response]
         self.device.launch_list(k.stretch, self.capacity, inputs)
-        self.device.launch(k.spread, len(self.ends), [self.ends, self.entries, self.weights, self.response, y])
+        self.device.launch(k.spread, len(self.ends), [self.frozen, self.response, y])
 
 
 def listed(count: int, *arrays: wp.array) -> list[np.ndarray]:

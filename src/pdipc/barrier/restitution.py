@@ -22,12 +22,13 @@ the time that sound needs to cross the softer body.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.pairs import ActivePairs, frozen
-from pdipc.device.language import func, kernel
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
 
@@ -57,8 +58,23 @@ def lighter(a: Scalar, b: Scalar):
 
 
 @functools.cache
+def law(real: Real) -> Any:
+    """A struct: what the law of impact knows of bodies; see `Restitution`."""
+    return struct_of(
+        "Law",
+        __name__,
+        mass=wp.array(dtype=real.scalar),  # kg
+        free=wp.array(dtype=real.scalar),
+        body_mass=wp.array(dtype=real.scalar),
+        rigidity=wp.array(dtype=real.scalar),
+        restitution=real.scalar,
+        h=real.scalar,  # s
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, Frozen = real.scalar, real.vec3, frozen(real)
+    scalar, vec3, Frozen, Law = real.scalar, real.vec3, frozen(real), law(real)
     mat43 = wp.types.matrix((4, 3), scalar)
     module = real.module(__name__)
 
@@ -77,11 +93,7 @@ def kernels(real: Real) -> SimpleNamespace:
         x_start: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         v_start: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        body_mass: wp.array(dtype=scalar),
-        rigidity: wp.array(dtype=scalar),
-        restitution: scalar,
-        h: scalar,
+        law: Law,
         target_out: wp.array(dtype=scalar),
         pull_out: wp.array(dtype=scalar),
         needed_out: wp.array(dtype=wp.int32),
@@ -97,14 +109,15 @@ def kernels(real: Real) -> SimpleNamespace:
                     i = q[s]
                     moved = x[i] - x_start[i]
                     now += pairs.weights[k][s] * wp.dot(pairs.normals[k], moved)
-                    if free[i] > scalar(0.0):
-                        moved = h * v_start[i]
+                    if law.free[i] > scalar(0.0):
+                        moved = law.h * v_start[i]
                     before += pairs.weights[k][s] * wp.dot(pairs.normals[k], moved)
-                target, engaged = parting(before, now, wp.min(rigidity[q[0]], rigidity[q[3]]), restitution)
+                rigidity = wp.min(law.rigidity[q[0]], law.rigidity[q[3]])
+                target, engaged = parting(before, now, rigidity, law.restitution)
                 target_out[k] = target
                 pull = scalar(0.0)
                 if engaged:
-                    pull = scalar(WEIGHT) * lighter(body_mass[q[0]], body_mass[q[3]]) / (h * h)
+                    pull = scalar(WEIGHT) * lighter(law.body_mass[q[0]], law.body_mass[q[3]]) / (law.h * law.h)
                 if pull > scalar(0.0):
                     needed_out[0] = 1  # whoever writes, writes the same
                 pull_out[k] = pull
@@ -114,16 +127,22 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         x_now: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar),
-        free: wp.array(dtype=scalar),
+        law: Law,
         elastic: wp.array(dtype=vec3),
-        h: scalar,
         force_out: wp.array(dtype=vec3),
         increment_out: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
-        force_out[i] = -free[i] * mass[i] / (h * h) * (x_now[i] - x[i]) - elastic[i]
+        force_out[i] = -law.free[i] * law.mass[i] / (law.h * law.h) * (x_now[i] - x[i]) - elastic[i]
         increment_out[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+
+    @func
+    def parted(pairs: Frozen, k: int, x_start: wp.array(dtype=vec3), x_now: wp.array(dtype=vec3)) -> scalar:
+        """How far the sides of pair k have moved apart along its normal, m."""
+        moved = vec3()
+        for s in range(4):
+            moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
+        return wp.dot(pairs.normals[k], moved)
 
     @kernel(module)
     def linearize(
@@ -140,12 +159,9 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
                 friction_out[k] = scalar(0.0)
                 hessian_out[k] = pull[k]
-                force_out[k] = pull[k] * (target[k] - wp.dot(pairs.normals[k], moved)) * pairs.normals[k]
+                force_out[k] = pull[k] * (target[k] - parted(pairs, k, x_start, x_now)) * pairs.normals[k]
 
     @kernel(module)
     def linearize_exact(
@@ -163,10 +179,7 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
-                slope = pull[k] * (wp.dot(pairs.normals[k], moved) - target[k])
+                slope = pull[k] * (parted(pairs, k, x_start, x_now) - target[k])
                 lever = mat43()
                 for s in range(4):
                     for axis in range(3):
@@ -195,20 +208,19 @@ def kernels(real: Real) -> SimpleNamespace:
         x_now: wp.array(dtype=vec3),
         v_start: wp.array(dtype=vec3),
         acceleration: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar),
-        h: scalar,
+        law: Law,
         square_out: wp.array(dtype=scalar),
         cross_out: wp.array(dtype=scalar),
         excess_out: wp.array(dtype=scalar),
     ):
         """Kinetic energy of v + s dv: s^2 square + s cross + ..., and how far it is at s = 0 above energy at the start plus work."""
         i = first + wp.tid()
-        v = (x[i] - x_start[i]) / h
-        dv = (x_now[i] - x[i]) / h
-        square_out[i] = scalar(0.5) * mass[i] * wp.dot(dv, dv)
-        cross_out[i] = mass[i] * wp.dot(v, dv)
-        given = scalar(0.5) * wp.dot(v_start[i], v_start[i]) + h * wp.dot(acceleration[i], v)
-        excess_out[i] = mass[i] * (scalar(0.5) * wp.dot(v, v) - given)
+        v = (x[i] - x_start[i]) / law.h
+        dv = (x_now[i] - x[i]) / law.h
+        square_out[i] = scalar(0.5) * law.mass[i] * wp.dot(dv, dv)
+        cross_out[i] = law.mass[i] * wp.dot(v, dv)
+        given = scalar(0.5) * wp.dot(v_start[i], v_start[i]) + law.h * wp.dot(acceleration[i], v)
+        excess_out[i] = law.mass[i] * (scalar(0.5) * wp.dot(v, v) - given)
 
     @kernel(module)
     def limit(first: int, sums: wp.array(dtype=scalar), part_out: wp.array(dtype=scalar)):
@@ -239,10 +251,7 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = span.first + wp.tid()
         for b in range(worker * span.block, pairs.count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, pairs.count[0])):
-                moved = vec3()
-                for s in range(4):
-                    moved += pairs.weights[k][s] * (x_now[pairs.quads[k][s]] - x_start[pairs.quads[k][s]])
-                rebound_out[k] = part[0] * pull[k] * (target[k] - wp.dot(pairs.normals[k], moved))
+                rebound_out[k] = part[0] * pull[k] * (target[k] - parted(pairs, k, x_start, x_now))
 
     @kernel(module)
     def shorten(first: int, x: wp.array(dtype=vec3), part: wp.array(dtype=scalar), x_now: wp.array(dtype=vec3)):
@@ -287,7 +296,8 @@ class Restitution:
         n = len(mass)
         self.device, self.pairs, self.kernels = device, pairs, kernels(real)
         self.mass, self.free, self.body_mass, self.rigidity = mass, free, body_mass, rigidity
-        self.restitution, self.h = real.scalar(restitution), real.scalar(h)
+        self.restitution, self.h = restitution, h
+        self.law = filled(law(real), self)
         self.u_now, self.elastic, self.zero = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(3))
         self.needed = wp.zeros(1, dtype=wp.int32, device=device.warp)
         self.energies = [wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(3)]
@@ -300,13 +310,13 @@ class Restitution:
         device.copy(self.u_now, x)
         device.launch_serial(k.clear, [self.needed])
         device.launch(k.forget, p.capacity, [p.rebound])
-        motion = [x_start, x, v_start, self.free, self.body_mass, self.rigidity, self.restitution, self.h]
+        motion = [x_start, x, v_start, self.law]
         # `gaps` and `stiffness` of the pairs are of no further use in this step
         device.launch_list(k.aim, p.capacity, [p.frozen, *motion, p.gaps, p.stiffness, self.needed])
 
     def inertia(self, x: wp.array, force_out: wp.array, increment_out: wp.array) -> None:
         """Launches the force of M and of the elastic forces at x; and a zero start for the increment."""
-        inputs = [self.u_now, x, self.mass, self.free, self.elastic, self.h, force_out, increment_out]
+        inputs = [self.u_now, x, self.law, self.elastic, force_out, increment_out]
         self.device.launch(self.kernels.inertia, len(x), inputs)
 
     def linearize(self, x_start: wp.array, rhs: wp.array) -> None:
@@ -322,13 +332,12 @@ class Restitution:
         assert isinstance(p, BarrierTerm)
         result = [p.energy_of_pair, p.slope, p.lever, p.hessian]
         self.device.launch_list(k.linearize_exact, p.capacity, [p.frozen, x_start, self.u_now, p.gaps, p.stiffness, *result])
-        inputs = [p.ends, p.entries, p.quads, p.free, *result]
-        self.device.launch(p.exact.gather, len(p.ends), [*inputs, p.force_of_vertex, p.diagonal, p.energy_of_vertex])
+        p.gather_pairs()
 
     def limit(self, x_start: wp.array, x: wp.array, v_start: wp.array, acceleration: wp.array) -> None:
         """Shortens the correction so that energy does not rise; elastic energies are in `sums` already."""
         k, device, n = self.kernels, self.device, len(x)
-        inputs = [x_start, x, self.u_now, v_start, acceleration, self.mass, self.h]
+        inputs = [x_start, x, self.u_now, v_start, acceleration, self.law]
         device.launch(k.kinetic, n, [*inputs, *self.energies])
         for values, place in zip(self.energies, (SQUARE, CROSS, EXCESS), strict=True):
             self.reducer.sum(values, self.sums, place)

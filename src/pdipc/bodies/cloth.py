@@ -17,13 +17,14 @@ from pdipc.constraints import (
     triangle_strain,
     triangles,
     woven,
+    woven_bending,
 )
 from pdipc.scene.assembly import AssembledBody, Assembly
 from pdipc.scene.check_garments import WARP
 from pdipc.scene.schema import ClothMaterial
 
 
-def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+def elasticity(assembly: Assembly, body: AssembledBody, newton: bool) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
     """The constraints of a cloth, and the masses (n,) kg of its vertices among all."""
     x, m = assembly.rest_positions, body.material
     assert isinstance(m, ClothMaterial)
@@ -55,6 +56,9 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
     if m.bending_stiffness:
         if m.bending == "curved":
             sets.append(curved_bending.rest(x, body.triangles, m.bending_stiffness))
+        elif m.weft_bending_stiffness:
+            stiffness = m.bending_stiffness, m.weft_bending_stiffness
+            sets.append(woven_bending.rest(x, body.triangles, *stiffness, m.warp or WARP, body.pattern))
         else:
             sets.append(quadratic_bending.rest(x, body.triangles, m.bending_stiffness, body.pattern))
     if body.inside is not None:
@@ -62,6 +66,12 @@ def elasticity(assembly: Assembly, body: AssembledBody) -> tuple[list[constraint
         sets.append(enclosed_volume.rest(outward, cavity, np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (len(cavity), 1))))
     mass = material.lumped_mass(len(x), body.triangles, m.areal_density * triangles.rest_shape(rest, corners)[1])
     return sets, mass
+
+
+def speed_of_sound(m: ClothMaterial) -> float:
+    """m/s, along the sheet."""
+    assert m.membrane_stiffness is not None  # its validator has set it
+    return float(np.sqrt(m.membrane_stiffness / m.areal_density))
 
 
 def seams(assembly: Assembly) -> list[constraints.ConstraintSet]:

@@ -3,41 +3,26 @@
 import numpy as np
 
 from pdipc import constraints
-from pdipc.bodies import cloth, rigid, rods
-from pdipc.constraints import (
-    axis_attachment,
-    corotated,
-    edge_length,
-    material,
-    neo_hookean,
-    point_attachment,
-    surface_attachment,
-    tet_strain,
-    tet_volume,
-    tets,
-)
+from pdipc.bodies import cloth, rigid, rods, solid
+from pdipc.constraints import axis_attachment, edge_length, point_attachment, surface_attachment
 from pdipc.scene.assembly import AssembledBody, Assembly
-from pdipc.scene.schema import ClothMaterial, RigidMaterial, RodMaterial, SolidMaterial
+
+# Each kind of body has a module with
+#     elasticity(assembly, body, newton)    its constraints, and the masses (n,) kg of its vertices among all
+#     speed_of_sound(material)              m/s, along the body
+# newton: whether for that solver, see `SolidMaterial.model`.
+KINDS = {"solid": solid, "cloth": cloth, "rod": rods, "rigid": rigid}
 
 
 def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The constraints of all bodies (Section 3) and the lumped masses (n,) kg. newton: for that solver, see `SolidMaterial.model`."""
+    """The constraints of all bodies (Section 3) and the lumped masses (n,) kg. newton: see `KINDS`."""
     x, n = assembly.rest_positions, len(assembly.positions)
     sets, mass = [], np.zeros(n)
     for body in assembly.bodies:
-        m = body.material
-        if isinstance(m, SolidMaterial):
-            own, its_mass = solid(x, body, m, newton)
-        elif isinstance(m, ClothMaterial):
-            own, its_mass = cloth.elasticity(assembly, body)
-        elif isinstance(m, RigidMaterial):
-            own, its_mass = rigid.elasticity(x, body, m)
-        elif isinstance(m, RodMaterial):
-            own, its_mass = rods.elasticity(x, body, m)
-        else:
-            continue
-        sets += own
-        mass += its_mass
+        if body.material is not None:
+            own, its_mass = KINDS[body.kind].elasticity(assembly, body, newton)
+            sets += own
+            mass += its_mass
     for pin in assembly.pins:
         if pin.anchored and pin.axes.all():
             sets.append(point_attachment.rest(pin.points, pin.vertices, pin.stiffness))
@@ -52,32 +37,6 @@ def elasticity(assembly: Assembly, newton: bool = False) -> tuple[list[constrain
     return sets + cloth.seams(assembly), mass
 
 
-def solid(
-    x: np.ndarray, body: AssembledBody, m: SolidMaterial, newton: bool
-) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The constraints of a solid at the rest positions x (n, 3), and its masses (n,) kg."""
-    strain, volume = material.solid(m.young_modulus, m.poisson_ratio)
-    model = m.model
-    if model == "auto":
-        model = "neo_hookean" if newton else "arap"
-    if model == "arap":
-        sets = [tet_strain.rest(x, body.tets, strain)]
-        if volume > 0.0:
-            sets.append(tet_volume.rest(x, body.tets, volume))
-    else:
-        kind = corotated if model == "corotated" else neo_hookean
-        sets = [kind.rest(x, body.tets, 0.5 * strain, volume / 3.0)]
-    return sets, material.lumped_mass(len(x), body.tets, m.density * tets.rest_shape(x, body.tets)[1])
-
-
-def speed_of_sound(of: SolidMaterial | ClothMaterial | RodMaterial | RigidMaterial) -> float:
+def speed_of_sound(body: AssembledBody) -> float:
     """m/s, along the body."""
-    if isinstance(of, SolidMaterial):
-        return float(np.sqrt(of.young_modulus / of.density))
-    if isinstance(of, RigidMaterial):
-        return float(np.sqrt(of.shape_stiffness / of.density))
-    if isinstance(of, RodMaterial):
-        assert of.stretch_stiffness is not None  # its validator has set it
-        return float(np.sqrt(of.stretch_stiffness / (of.density * np.pi * of.radius**2)))
-    assert of.membrane_stiffness is not None
-    return float(np.sqrt(of.membrane_stiffness / of.areal_density))
+    return KINDS[body.kind].speed_of_sound(body.material)

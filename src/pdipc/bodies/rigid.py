@@ -28,13 +28,20 @@ def torn(assembly: Assembly, positions: np.ndarray) -> str:
     return ""
 
 
-def elasticity(x: np.ndarray, body: AssembledBody, m: RigidMaterial) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
-    """The constraints of a rigid body at the rest positions x (n, 3), and its masses (n,) kg, a quarter at each of its four points.
+def elasticity(assembly: Assembly, body: AssembledBody, newton: bool) -> tuple[list[constraints.ConstraintSet], np.ndarray]:
+    """The constraints of a rigid body, and its masses (n,) kg among all, a quarter at each of its four points.
 
     The energy is that of an elastic body of `shape_stiffness` E and no Poisson's ratio, whose inside deforms alike everywhere.
     """
+    x, m = assembly.rest_positions, body.material
+    assert isinstance(m, RigidMaterial)
     tet = body.handles[None, :]
     part = body.volume / tet_volumes(x, tet)[0]
     mass = np.zeros(len(x))
     mass[body.handles] = 0.25 * m.density * body.volume
     return [corotated.rest(x, tet, 0.5 * part * m.shape_stiffness, 0.0 * part)], mass
+
+
+def speed_of_sound(m: RigidMaterial) -> float:
+    """m/s, of that elastic body."""
+    return float(np.sqrt(m.shape_stiffness / m.density))

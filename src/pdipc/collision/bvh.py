@@ -17,9 +17,21 @@ from pdipc.collision import moving_boxes as sweep
 from pdipc.collision import sieve
 from pdipc.collision.moving_boxes import Box, Boxes, join, load, meet
 from pdipc.collision.surface import Surface
-from pdipc.device.language import func, kernel
+from pdipc.device.language import func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
+
+
+@struct
+class Primitives:
+    """What is searched for what: a tree, and the surface that it is over."""
+
+    tree: wp.uint64
+    vertices: wp.array[wp.int32]
+    triangles: wp.array[wp.vec3i]
+    edges: wp.array[wp.vec2i]
+    obstacle: wp.array[wp.int32]
+    boxes: Boxes  # of vertices
 
 
 @functools.cache
@@ -72,28 +84,17 @@ def kernels(real: Real) -> SimpleNamespace:
         out[begin + p] = pair
 
     @func
-    def search_triangles(
-        i: int,
-        tree: wp.uint64,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        begin: int,
-        room: int,
-        out: wp.array(dtype=wp.vec2i),
-    ) -> int:
+    def search_triangles(i: int, o: Primitives, sieve: Sieve, begin: int, room: int, out: wp.array(dtype=wp.vec2i)) -> int:
         """Counts the triangles that the i-th vertex may meet, and lists them if there are no more than `room`."""
-        v = vertices[i]
+        v = o.vertices[i]
         found = int(0)
         j = int(0)
-        box = load(boxes, v)
-        query = wp.bvh_query_aabb(tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
+        box = load(o.boxes, v)
+        query = wp.bvh_query_aabb(o.tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
         while wp.bvh_query_next(query, j):
-            t = triangles[j]
-            obstacles = obstacle[v] + obstacle[t[0]] + obstacle[t[1]] + obstacle[t[2]]
-            if t[0] != v and t[1] != v and t[2] != v and obstacles < 4 and meet(box, of_triangle(boxes, t)):  # noqa: SIM102
+            t = o.triangles[j]
+            obstacles = o.obstacle[v] + o.obstacle[t[0]] + o.obstacle[t[1]] + o.obstacle[t[2]]
+            if t[0] != v and t[1] != v and t[2] != v and obstacles < 4 and meet(box, of_triangle(o.boxes, t)):  # noqa: SIM102
                 if passes.vertex_triangle(sieve, v, t):
                     if found < room:
                         insert(begin, found, wp.vec2i(v, j), out)
@@ -101,120 +102,35 @@ def kernels(real: Real) -> SimpleNamespace:
         return found
 
     @func
-    def search_edges(
-        i: int,
-        tree: wp.uint64,
-        edges: wp.array(dtype=wp.vec2i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        begin: int,
-        room: int,
-        out: wp.array(dtype=wp.vec2i),
-    ) -> int:
+    def search_edges(i: int, o: Primitives, sieve: Sieve, begin: int, room: int, out: wp.array(dtype=wp.vec2i)) -> int:
         """Counts the edges after the i-th that it may meet, and lists them if there are no more than `room`."""
-        a = edges[i]
+        a = o.edges[i]
         found = int(0)
         j = int(0)
-        box = of_edge(boxes, a)
-        query = wp.bvh_query_aabb(tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
+        box = of_edge(o.boxes, a)
+        query = wp.bvh_query_aabb(o.tree, wp.min(box.begin_low, box.end_low), wp.max(box.begin_high, box.end_high))
         while wp.bvh_query_next(query, j):
             if j > i:
-                b = edges[j]
-                obstacles = obstacle[a[0]] + obstacle[a[1]] + obstacle[b[0]] + obstacle[b[1]]
+                b = o.edges[j]
+                obstacles = o.obstacle[a[0]] + o.obstacle[a[1]] + o.obstacle[b[0]] + o.obstacle[b[1]]
                 apart = a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1]
-                if apart and obstacles < 4 and meet(box, of_edge(boxes, b)):  # noqa: SIM102
+                if apart and obstacles < 4 and meet(box, of_edge(o.boxes, b)):  # noqa: SIM102
                     if passes.edge_edge(sieve, a, b):
                         if found < room:
                             insert(begin, found, wp.vec2i(i, j), out)
                         found += 1
         return found
 
-    @kernel(module)
-    def find_triangles(
-        first: int,
-        tree: wp.uint64,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots_out: wp.array(dtype=wp.vec2i),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        found_out[i] = search_triangles(i, tree, vertices, triangles, obstacle, boxes, sieve, i * room, room, slots_out)
-
-    @kernel(module)
-    def find_edges(
-        first: int,
-        tree: wp.uint64,
-        edges: wp.array(dtype=wp.vec2i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots_out: wp.array(dtype=wp.vec2i),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        found_out[i] = search_edges(i, tree, edges, obstacle, boxes, sieve, i * room, room, slots_out)
-
-    @kernel(module)
-    def pack_triangles(
-        first: int,
-        tree: wp.uint64,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots: wp.array(dtype=wp.vec2i),
-        found: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        pairs_out: wp.array(dtype=wp.vec2i),
-        overflow: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        begin = ends[i] - found[i]
-        if begin < 0:
-            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
-        elif ends[i] <= pairs_out.shape[0]:
-            if found[i] > room:
-                search_triangles(i, tree, vertices, triangles, obstacle, boxes, sieve, begin, found[i], pairs_out)
-            else:
-                for k in range(found[i]):
-                    pairs_out[begin + k] = slots[i * room + k]
-
-    @kernel(module)
-    def pack_edges(
-        first: int,
-        tree: wp.uint64,
-        edges: wp.array(dtype=wp.vec2i),
-        obstacle: wp.array(dtype=wp.int32),
-        boxes: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots: wp.array(dtype=wp.vec2i),
-        found: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        pairs_out: wp.array(dtype=wp.vec2i),
-        overflow: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        begin = ends[i] - found[i]
-        if begin < 0:
-            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
-        elif ends[i] <= pairs_out.shape[0]:
-            if found[i] > room:
-                search_edges(i, tree, edges, obstacle, boxes, sieve, begin, found[i], pairs_out)
-            else:
-                for k in range(found[i]):
-                    pairs_out[begin + k] = slots[i * room + k]
-
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    find_triangles, pack_triangles = sweep.searching(module, "triangles", Primitives, Sieve, search_triangles)
+    find_edges, pack_edges = sweep.searching(module, "edges", Primitives, Sieve, search_edges)
+    return SimpleNamespace(
+        sweep_triangles=sweep_triangles,
+        sweep_edges=sweep_edges,
+        find_triangles=find_triangles,
+        pack_triangles=pack_triangles,
+        find_edges=find_edges,
+        pack_edges=pack_edges,
+    )
 
 
 class Bvh:
@@ -253,11 +169,16 @@ class Bvh:
         """Lists pairs; see `broad_phase.BroadPhase.find`. Recordable."""
         if not self.trees:
             return
-        k, s = self.kernels, self.surface
+        k = self.kernels
         self._fit(x0, x1, reach)
         for tree in self.trees:
             self.device.once(tree.refit)
-        triangle_tree, edge_tree = self.trees
-        inputs = [triangle_tree.id, s.vertices, s.triangles, s.obstacle, self.of_vertices, sieve]
-        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
-        self.edge_edge.fill(k.find_edges, k.pack_edges, [edge_tree.id, s.edges, s.obstacle, self.of_vertices, sieve])
+        over_triangles, over_edges = (self._primitives(tree) for tree in self.trees)
+        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, [over_triangles, sieve])
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [over_edges, sieve])
+
+    def _primitives(self, tree: wp.Bvh) -> Any:
+        s, made = self.surface, Primitives()
+        made.tree, made.boxes = tree.id, self.of_vertices
+        made.vertices, made.triangles, made.edges, made.obstacle = s.vertices, s.triangles, s.edges, s.obstacle
+        return made

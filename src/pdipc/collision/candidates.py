@@ -29,7 +29,7 @@ import warp as wp
 from pdipc.collision import distance, sieve
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
-from pdipc.device.language import func, kernel, struct_of
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Largest, Span
 from pdipc.device.precision import Real, Scalar
 
@@ -63,6 +63,20 @@ def vertices(real: Real) -> Any:
         inner_vertex=wp.array(dtype=wp.int32),  # whether it is inside a flat face
         flat=wp.array(dtype=wp.int32),  # of each body, whether it has the shape that these were found in
         ignored=wp.array(dtype=wp.vec2i),  # pairs of bodies that ignore each other
+    )
+
+
+@functools.cache
+def listed(real: Real) -> Any:
+    """A struct: the candidates of one kind as kernels read them; see `CandidateList`."""
+    return struct_of(
+        "Listed",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        quads=wp.array(dtype=wp.vec4i),
+        limits=wp.array(dtype=real.vec2),
+        faces=wp.array(dtype=wp.int32),
+        gaps=wp.array(dtype=real.scalar),
     )
 
 
@@ -218,7 +232,7 @@ class CandidateList:
     Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1). quads: (capacity,) vec4i. limits: (capacity,)
     vec2 of minimum separation xi and activation distance d_hat, m. faces: (capacity,) int32, the flat face that the triangle of a pair is part of, -1
     for none, or SILENT. count: (1,) int32 on the device.
-    gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`.
+    gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`. listed: what kernels take.
     """
 
     def __init__(self, device: Device, real: Real, kind: str):
@@ -231,11 +245,12 @@ class CandidateList:
             return wp.zeros(size, dtype=dtype, device=self.device.warp)
 
         real, blocks = self.real, -(-capacity // self.device.block)
-        self.quads = self.limits = self.faces = self.gaps = self.times = None  # the old ones are given back first
+        self.quads = self.limits = self.faces = self.gaps = self.times = self.listed = None  # the old ones are given back first
         self.count, self.capacity = count, capacity
         self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
         self.gaps, self.times, self.faces = make(capacity, real.scalar), make(capacity, wp.int32), make(capacity, wp.int32)
         self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
+        self.listed = filled(listed(real), self)
 
 
 class Candidates:

@@ -10,15 +10,25 @@ import numpy as np
 import warp as wp
 
 from pdipc.collision.candidates import Candidates
-from pdipc.device.language import kernel
+from pdipc.device.language import filled, kernel, struct
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
 MOST = 512  # bodies; of more, all are one island
 
 
+@struct
+class Groups:
+    """The bodies by island, as kernels take them; see `Islands`."""
+
+    count: int  # of bodies
+    body: wp.array[wp.int32]
+    label: wp.array[wp.int32]
+    driven: wp.array[wp.int32]
+
+
 @functools.cache
-def kernels(real: Real):
+def kernels(real: Real) -> SimpleNamespace:
     vec3 = real.vec3
     zero = wp.constant(real.scalar(0.0))
     module = real.module(__name__)
@@ -117,7 +127,7 @@ def kernels(real: Real):
 
 class Islands:
     """body: (n,) int32, the simulated body of each vertex, -1 for obstacles. label: (bodies,) the island of each body, named by its first body.
-    driven: (bodies,) whether something that follows a script moves the body in this outer iteration.
+    driven: (bodies,) whether something that follows a script moves the body in this outer iteration. groups: all these as kernels take them.
 
     beside: what else has pairs, each with `count`, `quads` and `capacity`: friction, whose pairs were near where the step started.
     ranges: (first, last) vertices of each simulated body; joined: (k, 2) bodies that attachments join; pinned: (k, 2) scripted
@@ -154,6 +164,7 @@ class Islands:
         size = 1 if self.together else max(1, self.count**2)
         self._near = wp.zeros(size, dtype=wp.int32, device=device.warp)
         self.driven = wp.zeros(max(1, self.count), dtype=wp.int32, device=device.warp)
+        self.groups = filled(Groups, self)
         self.beside: list = []
         self._kernels = kernels(real)
 

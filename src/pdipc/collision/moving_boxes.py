@@ -15,11 +15,12 @@ there is never empty, and an empty one, from +inf to -inf, is apart from all. So
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from pdipc.device.language import Kernel, func, kernel, struct
+from pdipc.device.language import Function, Kernel, func, kernel, struct
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -149,6 +150,52 @@ def kernels(real: Real) -> SimpleNamespace:
             overflow[0] = 1
 
     return SimpleNamespace(vertex_boxes=vertex_boxes, settle=settle)
+
+
+def searching(module: wp.Module, kind: str, operand: Any, sieve: Any, search: Function) -> tuple[Kernel, Kernel]:
+    """Two kernels over the first primitives of pairs of a kind, see `PairList.fill`: one that counts what each may meet and keeps what fits
+    its slots, and one that packs the slots and searches again where they did not hold all.
+
+    search(i, o, sieve, begin, room, out): a Warp function that counts the partners of primitive i, and lists them in out from `begin` on, as
+    long as there is `room`. operand, sieve: the types of o and sieve.
+    """
+
+    @kernel(module, f"find_{kind}")
+    def find(
+        first: int,
+        o: operand,
+        sieve: sieve,
+        room: int,
+        slots_out: wp.array(dtype=wp.vec2i),
+        found_out: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        found_out[i] = search(i, o, sieve, i * room, room, slots_out)
+
+    @kernel(module, f"pack_{kind}")
+    def pack(
+        first: int,
+        o: operand,
+        sieve: sieve,
+        room: int,
+        slots: wp.array(dtype=wp.vec2i),
+        found: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        overflow: wp.array(dtype=wp.int32),
+    ):
+        i = first + wp.tid()
+        begin = ends[i] - found[i]
+        if begin < 0:
+            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
+        elif ends[i] <= pairs_out.shape[0]:
+            if found[i] > room:
+                search(i, o, sieve, begin, found[i], pairs_out)
+            else:
+                for k in range(found[i]):
+                    pairs_out[begin + k] = slots[i * room + k]
+
+    return find, pack
 
 
 class PairList:

@@ -84,6 +84,20 @@ class Members:
     boxes: wp.array[wp.float32]  # (patches, 12, WIDTH): see above
 
 
+@struct
+class Searched:
+    """What is searched for what: the hierarchy, and the primitives by patch, of the surface that it is over."""
+
+    patches: Patches
+    vertex_members: Members
+    edge_members: Members
+    triangle_members: Members
+    vertices: wp.array[wp.int32]
+    edges: wp.array[wp.vec2i]
+    triangles: wp.array[wp.vec3i]
+    of_vertices: Boxes
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
@@ -116,36 +130,21 @@ def kernels(real: Real) -> SimpleNamespace:
         return box
 
     @kernel(module)
-    def fill_blocks(
-        first: int,
-        edge_members: Members,
-        triangle_members: Members,
-        edges: wp.array(dtype=wp.vec2i),
-        triangles: wp.array(dtype=wp.vec3i),
-        of_vertices: Boxes,
-    ):
+    def fill_blocks(first: int, o: Searched):
         slot = first + wp.tid()
         p = slot / width
-        r = edge_members.start[p] + slot % width
-        if r < edge_members.start[p + 1]:
-            e = edges[r]
-            store_in_block(edge_members.boxes, slot, join(load(of_vertices, e[0]), load(of_vertices, e[1])))
-        r = triangle_members.start[p] + slot % width
-        if r < triangle_members.start[p + 1]:
-            t = triangles[r]
-            box = join(join(load(of_vertices, t[0]), load(of_vertices, t[1])), load(of_vertices, t[2]))
-            store_in_block(triangle_members.boxes, slot, box)
+        r = o.edge_members.start[p] + slot % width
+        if r < o.edge_members.start[p + 1]:
+            e = o.edges[r]
+            store_in_block(o.edge_members.boxes, slot, join(load(o.of_vertices, e[0]), load(o.of_vertices, e[1])))
+        r = o.triangle_members.start[p] + slot % width
+        if r < o.triangle_members.start[p + 1]:
+            t = o.triangles[r]
+            box = join(join(load(o.of_vertices, t[0]), load(o.of_vertices, t[1])), load(o.of_vertices, t[2]))
+            store_in_block(o.triangle_members.boxes, slot, box)
 
     @kernel(module)
-    def fit_patches(
-        first: int,
-        patches: Patches,
-        vertex_members: Members,
-        edge_members: Members,
-        triangle_members: Members,
-        vertices: wp.array(dtype=wp.int32),
-        of_vertices: Boxes,
-    ):
+    def fit_patches(first: int, o: Searched):
         """The box of everything in a patch."""
         p = first + wp.tid()
         box = Box()
@@ -153,13 +152,13 @@ def kernels(real: Real) -> SimpleNamespace:
         box.begin_high = wp.vec3(-nowhere, -nowhere, -nowhere)
         box.end_low = box.begin_low
         box.end_high = box.begin_high
-        for r in range(vertex_members.start[p], vertex_members.start[p + 1]):
-            box = join(box, load(of_vertices, vertices[r]))
-        for k in range(edge_members.start[p + 1] - edge_members.start[p]):
-            box = join(box, load_from_block(edge_members.boxes, p, k))
-        for k in range(triangle_members.start[p + 1] - triangle_members.start[p]):
-            box = join(box, load_from_block(triangle_members.boxes, p, k))
-        store(patches.nodes, patches.leaves + p, box)
+        for r in range(o.vertex_members.start[p], o.vertex_members.start[p + 1]):
+            box = join(box, load(o.of_vertices, o.vertices[r]))
+        for k in range(o.edge_members.start[p + 1] - o.edge_members.start[p]):
+            box = join(box, load_from_block(o.edge_members.boxes, p, k))
+        for k in range(o.triangle_members.start[p + 1] - o.triangle_members.start[p]):
+            box = join(box, load_from_block(o.triangle_members.boxes, p, k))
+        store(o.patches.nodes, o.patches.leaves + p, box)
 
     @func
     def refit(patches: Patches, node: int):
@@ -212,43 +211,35 @@ def kernels(real: Real) -> SimpleNamespace:
         elif patches.neighbours_end[p] <= patches.capacity:
             traverse(patches, p, begin, True)
 
-    # Arguments: two sides with their boxes, and where what is found goes.
     @func
-    def search_triangles(
-        r: int,
-        patches: Patches,
-        vertex_members: Members,
-        members: Members,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        of_vertices: Boxes,
-        sieve: Sieve,
-        begin: int,
-        room: int,
-        out: wp.array(dtype=wp.vec2i),
-    ) -> int:
-        """Counts the triangles that the vertex at position r may meet; the first `room` of them go to `out`."""
-        p = vertex_members.home[r]
-        bit = wp.uint32(1) << wp.uint32(r - vertex_members.start[p])
-        obstacle = vertex_members.moving[p] & bit == wp.uint32(0)
-        v = vertices[r]
-        box = load(of_vertices, v)
-        first_neighbour = int(0)
+    def first_neighbour(patches: Patches, p: int) -> int:
+        """Where the patches that p overlaps begin."""
+        begin = int(0)
         if p > 0:
-            first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
+            begin = wp.max(patches.neighbours_end[p - 1], 0)
+        return begin
+
+    @func
+    def search_triangles(r: int, o: Searched, sieve: Sieve, begin: int, room: int, out: wp.array(dtype=wp.vec2i)) -> int:
+        """Counts the triangles that the vertex at position r may meet; the first `room` of them go to `out`."""
+        p = o.vertex_members.home[r]
+        bit = wp.uint32(1) << wp.uint32(r - o.vertex_members.start[p])
+        obstacle = o.vertex_members.moving[p] & bit == wp.uint32(0)
+        v = o.vertices[r]
+        box = load(o.of_vertices, v)
         found = int(0)
-        for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
-            q = patches.neighbours[n]
-            if meet(box, load(patches.nodes, patches.leaves + q)):
-                mask = meeting(members.boxes, q, box)
+        for n in range(first_neighbour(o.patches, p), wp.min(o.patches.neighbours_end[p], o.patches.capacity)):
+            q = o.patches.neighbours[n]
+            if meet(box, load(o.patches.nodes, o.patches.leaves + q)):
+                mask = meeting(o.triangle_members.boxes, q, box)
                 if q == p:
-                    mask = mask & vertex_members.inside[r]
+                    mask = mask & o.vertex_members.inside[r]
                 elif obstacle:
-                    mask = mask & members.moving[q]
+                    mask = mask & o.triangle_members.moving[q]
                 while mask != wp.uint32(0):
-                    k = members.start[q] + lowest_bit(mask)
+                    k = o.triangle_members.start[q] + lowest_bit(mask)
                     mask = mask & (mask - wp.uint32(1))
-                    t = triangles[k]
+                    t = o.triangles[k]
                     if t[0] != v and t[1] != v and t[2] != v:  # noqa: SIM102  (Warp evaluates both sides of an "and")
                         if passes.vertex_triangle(sieve, v, t):
                             if found < room:
@@ -257,38 +248,26 @@ def kernels(real: Real) -> SimpleNamespace:
         return found
 
     @func
-    def search_edges(
-        r: int,
-        patches: Patches,
-        members: Members,
-        edges: wp.array(dtype=wp.vec2i),
-        sieve: Sieve,
-        begin: int,
-        room: int,
-        out: wp.array(dtype=wp.vec2i),
-    ) -> int:
+    def search_edges(r: int, o: Searched, sieve: Sieve, begin: int, room: int, out: wp.array(dtype=wp.vec2i)) -> int:
         """Counts the edges after position r that the edge there may meet; the first `room` of them go to `out`."""
-        p = members.home[r]
-        own = r - members.start[p]
-        obstacle = members.moving[p] & (wp.uint32(1) << wp.uint32(own)) == wp.uint32(0)
-        a = edges[r]
-        box = load_from_block(members.boxes, p, own)
-        first_neighbour = int(0)
-        if p > 0:
-            first_neighbour = wp.max(patches.neighbours_end[p - 1], 0)
+        p = o.edge_members.home[r]
+        own = r - o.edge_members.start[p]
+        obstacle = o.edge_members.moving[p] & (wp.uint32(1) << wp.uint32(own)) == wp.uint32(0)
+        a = o.edges[r]
+        box = load_from_block(o.edge_members.boxes, p, own)
         found = int(0)
-        for n in range(first_neighbour, wp.min(patches.neighbours_end[p], patches.capacity)):
-            q = patches.neighbours[n]
-            if q >= p and meet(box, load(patches.nodes, patches.leaves + q)):
-                mask = meeting(members.boxes, q, box)
+        for n in range(first_neighbour(o.patches, p), wp.min(o.patches.neighbours_end[p], o.patches.capacity)):
+            q = o.patches.neighbours[n]
+            if q >= p and meet(box, load(o.patches.nodes, o.patches.leaves + q)):
+                mask = meeting(o.edge_members.boxes, q, box)
                 if q == p:
-                    mask = mask & members.inside[r]
+                    mask = mask & o.edge_members.inside[r]
                 elif obstacle:
-                    mask = mask & members.moving[q]
+                    mask = mask & o.edge_members.moving[q]
                 while mask != wp.uint32(0):
-                    k = members.start[q] + lowest_bit(mask)
+                    k = o.edge_members.start[q] + lowest_bit(mask)
                     mask = mask & (mask - wp.uint32(1))
-                    b = edges[k]
+                    b = o.edges[k]
                     if a[0] != b[0] and a[0] != b[1] and a[1] != b[0] and a[1] != b[1]:  # noqa: SIM102
                         if passes.edge_edge(sieve, a, b):
                             if found < room:
@@ -296,95 +275,20 @@ def kernels(real: Real) -> SimpleNamespace:
                             found += 1
         return found
 
-    @kernel(module)
-    def find_triangles(
-        first: int,
-        patches: Patches,
-        vertex_members: Members,
-        members: Members,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        of_vertices: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots_out: wp.array(dtype=wp.vec2i),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        r = first + wp.tid()
-        found_out[r] = search_triangles(
-            r, patches, vertex_members, members, vertices, triangles, of_vertices, sieve, r * room, room, slots_out
-        )
-
-    @kernel(module)
-    def find_edges(
-        first: int,
-        patches: Patches,
-        members: Members,
-        edges: wp.array(dtype=wp.vec2i),
-        sieve: Sieve,
-        room: int,
-        slots_out: wp.array(dtype=wp.vec2i),
-        found_out: wp.array(dtype=wp.int32),
-    ):
-        r = first + wp.tid()
-        found_out[r] = search_edges(r, patches, members, edges, sieve, r * room, room, slots_out)
-
-    @kernel(module)
-    def pack_triangles(
-        first: int,
-        patches: Patches,
-        vertex_members: Members,
-        members: Members,
-        vertices: wp.array(dtype=wp.int32),
-        triangles: wp.array(dtype=wp.vec3i),
-        of_vertices: Boxes,
-        sieve: Sieve,
-        room: int,
-        slots: wp.array(dtype=wp.vec2i),
-        found: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        pairs_out: wp.array(dtype=wp.vec2i),
-        overflow: wp.array(dtype=wp.int32),
-    ):
-        r = first + wp.tid()
-        begin = ends[r] - found[r]
-        if begin < 0:
-            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
-        elif ends[r] <= pairs_out.shape[0]:
-            if found[r] > room:
-                search_triangles(
-                    r, patches, vertex_members, members, vertices, triangles, of_vertices, sieve, begin, found[r], pairs_out
-                )
-            else:
-                for k in range(found[r]):
-                    pairs_out[begin + k] = slots[r * room + k]
-
-    @kernel(module)
-    def pack_edges(
-        first: int,
-        patches: Patches,
-        members: Members,
-        edges: wp.array(dtype=wp.vec2i),
-        sieve: Sieve,
-        room: int,
-        slots: wp.array(dtype=wp.vec2i),
-        found: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        pairs_out: wp.array(dtype=wp.vec2i),
-        overflow: wp.array(dtype=wp.int32),
-    ):
-        r = first + wp.tid()
-        begin = ends[r] - found[r]
-        if begin < 0:
-            overflow[0] = 1  # more than 2^31 pairs: the scan has wrapped
-        elif ends[r] <= pairs_out.shape[0]:
-            if found[r] > room:
-                search_edges(r, patches, members, edges, sieve, begin, found[r], pairs_out)
-            else:
-                for k in range(found[r]):
-                    pairs_out[begin + k] = slots[r * room + k]
-
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    find_triangles, pack_triangles = sweep.searching(module, "triangles", Searched, Sieve, search_triangles)
+    find_edges, pack_edges = sweep.searching(module, "edges", Searched, Sieve, search_edges)
+    return SimpleNamespace(
+        fill_blocks=fill_blocks,
+        fit_patches=fit_patches,
+        refit_level=refit_level,
+        refit_top=refit_top,
+        count_neighbours=count_neighbours,
+        list_neighbours=list_neighbours,
+        find_triangles=find_triangles,
+        pack_triangles=pack_triangles,
+        find_edges=find_edges,
+        pack_edges=pack_edges,
+    )
 
 
 class PatchCulling:
@@ -459,13 +363,13 @@ class PatchCulling:
         """Lists pairs; see `broad_phase.BroadPhase.find`. Recordable."""
         if self.count == 0:
             return
-        device, k, s, tree = self.device, self.kernels, self.surface, self.tree
-        of_vertices, (vertex_members, edge_members, triangle_members) = self.of_vertices, self.members
-        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, of_vertices])
-        inputs = [edge_members, triangle_members, s.edges, s.triangles, of_vertices]
-        device.launch(k.fill_blocks, self.count * WIDTH, inputs)
-        inputs = [tree, vertex_members, edge_members, triangle_members, s.vertices, of_vertices]
-        device.launch(k.fit_patches, self.count, inputs, grain=WIDTH)
+        device, k, s, tree, o = self.device, self.kernels, self.surface, self.tree, Searched()
+        o.patches, o.of_vertices = tree, self.of_vertices
+        o.vertex_members, o.edge_members, o.triangle_members = self.members
+        o.vertices, o.edges, o.triangles = s.vertices, s.edges, s.triangles
+        device.launch(self.sweep.vertex_boxes, len(x0), [x0, x1, reach, self.of_vertices])
+        device.launch(k.fill_blocks, self.count * WIDTH, [o])
+        device.launch(k.fit_patches, self.count, [o], grain=WIDTH)
         if device.wide:
             begin = tree.leaves
             while begin > 1:
@@ -478,9 +382,8 @@ class PatchCulling:
         inputs = [tree.neighbours_end, tree.capacity, self.neighbour_count, self.overflow]
         device.launch_serial(self.sweep.settle, inputs)
         device.launch(k.list_neighbours, self.count, [tree, self.found, self.overflow], grain=64)
-        inputs = [tree, vertex_members, triangle_members, s.vertices, s.triangles, of_vertices, sieve]
-        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, inputs)
-        self.edge_edge.fill(k.find_edges, k.pack_edges, [tree, edge_members, s.edges, sieve])
+        self.vertex_triangle.fill(k.find_triangles, k.pack_triangles, [o, sieve])
+        self.edge_edge.fill(k.find_edges, k.pack_edges, [o, sieve])
 
     def statistics(self) -> dict[str, int]:
         """Of the last `find`: patches, overlapping pairs of patches, and candidates within a patch and between patches."""

@@ -21,13 +21,14 @@ drags every body of the scene (docs/paper_map.md).
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from pdipc.collision import ccd, distance
-from pdipc.collision.candidates import Candidates
-from pdipc.device.language import kernel
+from pdipc.collision.candidates import Candidates, listed
+from pdipc.device.language import filled, kernel, struct_of
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
@@ -43,8 +44,23 @@ MAX_PASSES = 60  # and after which all do
 
 
 @functools.cache
+def truncated(real: Real) -> Any:
+    """A struct: the motion that is left, and how the passes stand; see `Truncation`."""
+    return struct_of(
+        "Truncated",
+        __name__,
+        fraction=wp.array(dtype=real.scalar),
+        first_fraction=wp.array(dtype=real.scalar),
+        u_end=wp.array(dtype=real.vec3),
+        x_end=wp.array(dtype=real.vec3),
+        passes=wp.array(dtype=wp.int32),
+        going=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec2, vec3, vec4 = real.scalar, real.vec2, real.vec3, real.vec4
+    scalar, vec3, vec4, Truncated, Listed = real.scalar, real.vec3, real.vec4, truncated(real), listed(real)
     module = real.module(__name__)
     c = ccd.functions(real)
     unit = wp.constant(UNIT)
@@ -55,55 +71,51 @@ def kernels(real: Real) -> SimpleNamespace:
         @kernel(module, f"sweep_{kind}")
         def sweep_pairs(
             span: Span,
-            count: wp.array(dtype=wp.int32),
+            pairs: Listed,
             x: wp.array(dtype=vec3),
-            x_end: wp.array(dtype=vec3),
-            fraction: wp.array(dtype=scalar),
-            passes: wp.array(dtype=wp.int32),
-            quads: wp.array(dtype=wp.vec4i),
-            limits: wp.array(dtype=vec2),
-            island_of: wp.array(dtype=wp.int32),
+            t: Truncated,
+            body: wp.array(dtype=wp.int32),
             time_out: wp.array(dtype=wp.int32),
             hits_out: wp.array(dtype=wp.int32),
             deep_out: wp.array(dtype=wp.int32),
         ):
             worker = span.first + wp.tid()
             backoff = scalar(FIRST_BACKOFF)
-            if passes[0] > 0:
+            if t.passes[0] > 0:
                 backoff = scalar(LATER_BACKOFF)
-            for begin in range(worker * span.block, count[0], span.step * span.block):
+            for begin in range(worker * span.block, pairs.count[0], span.step * span.block):
                 hits = int(0)
-                for k in range(begin, wp.min(begin + span.block, count[0])):
-                    q = quads[k]
+                for k in range(begin, wp.min(begin + span.block, pairs.count[0])):
+                    q = pairs.quads[k]
                     time = unit
-                    shortest = wp.min(wp.min(fraction[q[0]], fraction[q[1]]), wp.min(fraction[q[2]], fraction[q[3]]))
-                    if (passes[0] == 0 or shortest < scalar(1.0)) and limits[k][1] >= scalar(0.0):
-                        xi = limits[k][0]
-                        t = scalar(2.0)
+                    shortest = wp.min(wp.min(t.fraction[q[0]], t.fraction[q[1]]), wp.min(t.fraction[q[2]], t.fraction[q[3]]))
+                    if (t.passes[0] == 0 or shortest < scalar(1.0)) and pairs.limits[k][1] >= scalar(0.0):
+                        xi = pairs.limits[k][0]
+                        when = scalar(2.0)
                         if wp.static(edge_edge):
-                            t = c.edge_edge(
+                            when = c.edge_edge(
                                 x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                                x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], xi, backoff, limits[k][1],
+                                t.x_end[q[0]], t.x_end[q[1]], t.x_end[q[2]], t.x_end[q[3]], xi, backoff, pairs.limits[k][1],
                             )  # fmt: skip
                         else:
-                            t = c.vertex_triangle(
+                            when = c.vertex_triangle(
                                 x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                                x_end[q[0]], x_end[q[1]], x_end[q[2]], x_end[q[3]], xi, backoff, limits[k][1],
+                                t.x_end[q[0]], t.x_end[q[1]], t.x_end[q[2]], t.x_end[q[3]], xi, backoff, pairs.limits[k][1],
                             )  # fmt: skip
-                        if t <= scalar(1.0):
-                            time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
+                        if when <= scalar(1.0):
+                            time = wp.int32(wp.floor(when * scalar(unit) * scalar(0.999999)))
                             hits += 1
                             apart = scalar(0.0)
                             if wp.static(edge_edge):
                                 apart = scalar(distance.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
                             else:
                                 apart = scalar(distance.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                            if apart - xi < scalar(DEEP) * limits[k][1]:
+                            if apart - xi < scalar(DEEP) * pairs.limits[k][1]:
                                 # whoever writes, writes the same
-                                if island_of[q[0]] >= 0:
-                                    deep_out[island_of[q[0]]] = 1
-                                if island_of[q[3]] >= 0:
-                                    deep_out[island_of[q[3]]] = 1
+                                if body[q[0]] >= 0:
+                                    deep_out[body[q[0]]] = 1
+                                if body[q[3]] >= 0:
+                                    deep_out[body[q[3]]] = 1
                     time_out[k] = time
                 hits_out[begin // span.block] = hits
 
@@ -134,12 +146,10 @@ def kernels(real: Real) -> SimpleNamespace:
         @kernel(module, f"spread_{kind}")
         def spread_times(
             span: Span,
-            count: wp.array(dtype=wp.int32),
+            pairs: Listed,
             x: wp.array(dtype=vec3),
-            x_end: wp.array(dtype=vec3),
+            t: Truncated,
             rigid: wp.array(dtype=wp.int32),
-            passes: wp.array(dtype=wp.int32),
-            quads: wp.array(dtype=wp.vec4i),
             times: wp.array(dtype=wp.int32),
             hits: wp.array(dtype=wp.int32),
             multiplier: wp.array(dtype=wp.int32),
@@ -147,14 +157,14 @@ def kernels(real: Real) -> SimpleNamespace:
         ):
             """The vertices of a pair that is hit are shortened; but an obstacle that withdraws is not held by what comes after it."""
             worker = span.first + wp.tid()
-            for begin in range(worker * span.block, count[0], span.step * span.block):
+            for begin in range(worker * span.block, pairs.count[0], span.step * span.block):
                 if hits[begin // span.block] > 0:
                     any_hit[0] = 1
-                    for k in range(begin, wp.min(begin + span.block, count[0])):
+                    for k in range(begin, wp.min(begin + span.block, pairs.count[0])):
                         if times[k] < unit:
-                            q = quads[k]
+                            q = pairs.quads[k]
                             withdraws = int(0)
-                            if passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
+                            if t.passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
                                 a = vec4()
                                 if wp.static(edge_edge):
                                     a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
@@ -164,7 +174,7 @@ def kernels(real: Real) -> SimpleNamespace:
                                 away = scalar(0.0)
                                 for s in range(4):
                                     if rigid[q[s]] != 0:
-                                        away += a[s] * wp.dot(apart, x_end[q[s]] - x[q[s]])
+                                        away += a[s] * wp.dot(apart, t.x_end[q[s]] - x[q[s]])
                                 if away >= scalar(0.0):
                                     withdraws = 1
                             for s in range(4):
@@ -219,25 +229,23 @@ def kernels(real: Real) -> SimpleNamespace:
     def shorten(
         first: int,
         multiplier: wp.array(dtype=wp.int32),
-        passes: wp.array(dtype=wp.int32),
-        fraction: wp.array(dtype=scalar),
-        first_fraction: wp.array(dtype=scalar),
+        t: Truncated,
     ):
         i = first + wp.tid()
         if multiplier[i] < unit:
             shrink = scalar(1.0)
-            if passes[0] > 0:
+            if t.passes[0] > 0:
                 shrink = scalar(SHRINK)
-            f = fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
-            if passes[0] >= STUBBORN:
+            f = t.fraction[i] * shrink * scalar(multiplier[i]) / scalar(unit)
+            if t.passes[0] >= STUBBORN:
                 # not settled: these stay where they are, and the next outer iteration starts from a stronger barrier
                 f = scalar(0.0)
-            fraction[i] = f
-            if passes[0] == 0:
-                first_fraction[i] = f
-        if passes[0] >= MAX_PASSES:
+            t.fraction[i] = f
+            if t.passes[0] == 0:
+                t.first_fraction[i] = f
+        if t.passes[0] >= MAX_PASSES:
             # nobody moves, which is always feasible
-            fraction[i] = scalar(0.0)
+            t.fraction[i] = scalar(0.0)
 
     @kernel(module)
     def grade(
@@ -267,48 +275,36 @@ def kernels(real: Real) -> SimpleNamespace:
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
-        fraction: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
+        t: Truncated,
     ):
         i = first + wp.tid()
-        if fraction[i] < scalar(1.0):
-            u_end_out[i] = u[i] + fraction[i] * (u_tilde[i] - u[i])
-            x_end_out[i] = base[i] + u_end_out[i]
+        if t.fraction[i] < scalar(1.0):
+            t.u_end[i] = u[i] + t.fraction[i] * (u_tilde[i] - u[i])
+            t.x_end[i] = base[i] + t.u_end[i]
 
     @kernel(module)
-    def decide(
-        first: int,
-        any_hit: wp.array(dtype=wp.int32),
-        passes: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
-    ):
-        going_out[0] = 0
+    def decide(first: int, any_hit: wp.array(dtype=wp.int32), t: Truncated):
+        t.going[0] = 0
         if any_hit[0] == 1:
-            if passes[0] < MAX_PASSES:
-                going_out[0] = 1
-            passes[0] = passes[0] + 1
+            if t.passes[0] < MAX_PASSES:
+                t.going[0] = 1
+            t.passes[0] = t.passes[0] + 1
 
     @kernel(module)
     def begin_pass(
         first: int,
         base: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
-        fraction_out: wp.array(dtype=scalar),
-        first_fraction_out: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
-        passes_out: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
+        t_out: Truncated,
     ):
         i = first + wp.tid()
-        fraction_out[i] = scalar(1.0)
-        first_fraction_out[i] = scalar(1.0)
-        u_end_out[i] = u_tilde[i]
-        x_end_out[i] = base[i] + u_tilde[i]
+        t_out.fraction[i] = scalar(1.0)
+        t_out.first_fraction[i] = scalar(1.0)
+        t_out.u_end[i] = u_tilde[i]
+        t_out.x_end[i] = base[i] + u_tilde[i]
         if i == 0:
-            passes_out[0] = 0
-            going_out[0] = 1
+            t_out.passes[0] = 0
+            t_out.going[0] = 1
 
     return SimpleNamespace(
         sweep_vertex_triangle=sweep("vertex_triangle"),
@@ -335,7 +331,8 @@ class Truncation:
     neighbours: offsets (n + 1,) and columns of those that elasticity
     connects, or None. bodies: vertices (k,) of those that move as four points do, and so keep one time. body: (n,) the body of each vertex, -1 for none; deep: (bodies,) which bodies have a hit at a gap below DEEP d_hat; these are
     set by who wants to know. u_end, x_end: (n,) vec3, the result; fraction: (n,), the part of its motion
-    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device.
+    that each vertex keeps, and first_fraction: what the first pass left it, the pair's time; passes: (1,) int32 on the device. truncated: these as
+    kernels take them.
     """
 
     def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True, bodies: Sequence[np.ndarray] = ()):
@@ -352,6 +349,7 @@ class Truncation:
         self.bodies = list(bodies)
         self.keep_rigid([])
         self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
+        self.truncated = filled(truncated(real), self)
 
     def keep_rigid(self, groups: list[np.ndarray]) -> None:
         """Vertices (k,) of each obstacle that must stay rigid: these share one time. What was recorded has to be recorded again."""
@@ -378,8 +376,7 @@ class Truncation:
         """
         if self.body_count:
             self.device.launch(self.kernels.clear, self.body_count, [self.deep])
-        first = [self.fraction, self.first_fraction, self.u_end, self.x_end, self.passes, self.going]
-        self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, *first])
+        self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, self.truncated])
         self.prove(candidates, base, u, u_tilde, x)
 
     def prove(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
@@ -391,35 +388,12 @@ class Truncation:
         def sweep() -> None:
             device.launch(k.reset, n, [self.group_count, self.multiplier, self.least, self.any_hit])
             for c in candidates.lists:
-                inputs = [
-                    c.count,
-                    x,
-                    self.x_end,
-                    self.fraction,
-                    self.passes,
-                    c.quads,
-                    c.limits,
-                    self.body,
-                    c.times,
-                    c.found,
-                    self.deep,
-                ]
+                inputs = [c.listed, x, self.truncated, self.body, c.times, c.found, self.deep]
                 device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
-                inputs = [
-                    c.count,
-                    x,
-                    self.x_end,
-                    self.rigid,
-                    self.passes,
-                    c.quads,
-                    c.times,
-                    c.found,
-                    self.multiplier,
-                    self.any_hit,
-                ]
+                inputs = [c.listed, x, self.truncated, self.rigid, c.times, c.found, self.multiplier, self.any_hit]
                 device.launch_scatter(getattr(k, f"spread_{c.kind}"), c.capacity, inputs)
             device.when(self.any_hit, shorten)
-            device.launch_serial(k.decide, [self.any_hit, self.passes, self.going])
+            device.launch_serial(k.decide, [self.any_hit, self.truncated])
 
         def shorten() -> None:
             if self.group_count and device.wide:
@@ -427,14 +401,14 @@ class Truncation:
                 device.launch(k.spread_least, n, [self.group_of, self.least, self.multiplier])
             elif self.group_count:
                 device.launch(k.together, self.group_count, [self.group_ends, self.group_members, self.multiplier])
-            device.launch(k.shorten, n, [self.multiplier, self.passes, self.fraction, self.first_fraction])
+            device.launch(k.shorten, n, [self.multiplier, self.truncated])
             if self.neighbours is not None:
                 for _ in range(RINGS // 2):
                     for before, after in ((self.fraction, self.graded), (self.graded, self.fraction)):
                         device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
                 if self.bodies:
                     device.launch(k.level, self.group_count, [self.group_ends, self.group_members, self.fraction])
-            device.launch(k.place, n, [base, u, u_tilde, self.fraction, self.u_end, self.x_end])
+            device.launch(k.place, n, [base, u, u_tilde, self.truncated])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from pdipc.device.language import func
-from pdipc.device.precision import Mat33, Scalar, unit_roundoff
+from pdipc.device.precision import Mat33, Scalar, Vec3, unit_roundoff
 
 SWEEPS = 5  # of the three rotations; four already reach rounding
 
@@ -23,9 +23,19 @@ def turn(app: Scalar, aqq: Scalar, apq: Scalar):
 
 
 @func
+def rotated(app: Scalar, aqq: Scalar, apq: Scalar, apr: Scalar, aqr: Scalar, vp: Vec3, vq: Vec3):
+    """The entries and the columns p and q of the vectors after the rotation that annihilates apq; r is the third axis."""
+    c, s = turn(app, aqq, apq)
+    two = type(apq)(2.0)
+    tpp = c * c * app - two * s * c * apq + s * s * aqq
+    tqq = s * s * app + two * s * c * apq + c * c * aqq
+    return tpp, tqq, c * apr - s * aqr, s * apr + c * aqr, c * vp - s * vq, s * vp + c * vq
+
+
+@func
 def symmetric(a: Mat33):
     """Eigenvalues (vec3) and the matrix whose columns are the eigenvectors, of the symmetric part of a."""
-    zero, one, half, two = type(a[0][0])(0.0), type(a[0][0])(1.0), type(a[0][0])(0.5), type(a[0][0])(2.0)
+    zero, one, half = type(a[0][0])(0.0), type(a[0][0])(1.0), type(a[0][0])(0.5)
     a00 = a[0, 0]
     a11 = a[1, 1]
     a22 = a[2, 2]
@@ -39,42 +49,12 @@ def symmetric(a: Mat33):
     for _ in range(SWEEPS):
         if wp.abs(a01) + wp.abs(a02) + wp.abs(a12) <= unit_roundoff(size) * size:
             break
-        c, s = turn(a00, a11, a01)
-        t00 = c * c * a00 - two * s * c * a01 + s * s * a11
-        t11 = s * s * a00 + two * s * c * a01 + c * c * a11
-        t02 = c * a02 - s * a12
-        a12 = s * a02 + c * a12
-        a02 = t02
-        a00 = t00
-        a11 = t11
+        a00, a11, a02, a12, v0, v1 = rotated(a00, a11, a01, a02, a12, v0, v1)
         a01 = zero
-        w = c * v0 - s * v1
-        v1 = s * v0 + c * v1
-        v0 = w
-        c, s = turn(a00, a22, a02)
-        t00 = c * c * a00 - two * s * c * a02 + s * s * a22
-        t22 = s * s * a00 + two * s * c * a02 + c * c * a22
-        t01 = c * a01 - s * a12
-        a12 = s * a01 + c * a12
-        a01 = t01
-        a00 = t00
-        a22 = t22
+        a00, a22, a01, a12, v0, v2 = rotated(a00, a22, a02, a01, a12, v0, v2)
         a02 = zero
-        w = c * v0 - s * v2
-        v2 = s * v0 + c * v2
-        v0 = w
-        c, s = turn(a11, a22, a12)
-        t11 = c * c * a11 - two * s * c * a12 + s * s * a22
-        t22 = s * s * a11 + two * s * c * a12 + c * c * a22
-        t01 = c * a01 - s * a02
-        a02 = s * a01 + c * a02
-        a01 = t01
-        a11 = t11
-        a22 = t22
+        a11, a22, a01, a02, v1, v2 = rotated(a11, a22, a12, a01, a02, v1, v2)
         a12 = zero
-        w = c * v1 - s * v2
-        v2 = s * v1 + c * v2
-        v1 = w
     return type(a[0])(a00, a11, a22), wp.matrix_from_cols(v0, v1, v2)
 
 

@@ -14,6 +14,7 @@ the Hessian is to be positive semidefinite. What is left then, mass and membrane
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -22,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pdipc.constraints import tets
 from pdipc.constraints.base import ConstraintSet, make_set
-from pdipc.device.language import func, kernel
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
@@ -106,12 +107,26 @@ def pressure_energy(volume: wide, reference: wide, law: Law) -> wide:
     return reference * (liquid - law[0] * change - gas)
 
 
+@functools.cache
+def held(real: Real) -> Any:
+    """A struct: the cavities of the triangles, and what they hold."""
+    return struct_of(
+        "Held",
+        __name__,
+        number=wp.array(dtype=wp.int32),  # of each triangle, its cavity
+        leader=wp.array(dtype=wp.int32),  # of each triangle, the cavity that it stands for, -1 for none
+        first=wp.array(dtype=wp.int32),  # of each cavity, its first vertex
+        pressure=wp.array(dtype=real.scalar),  # Pa
+        energy=wp.array(dtype=wide),  # J
+    )
+
+
 class Cavities:
     """Volumes and pressures of all cavities of a set, and their part of the Newton matrix that no block holds.
 
     reference: (c,) m^3, the volumes at which energies are zero; 0 for V0. Newton's method counts from the last iterate, see `_keep_energies` there.
     names: (c,) first vertices. laws: (c,) see the module; assign to it to change them. volume: (c,) float64, m^3; pressure: (c,), Pa.
-    diagonal: None, it adds nothing to the preconditioner: one direction more costs conjugate gradients an iteration or two.
+    held: what kernels take. diagonal: None, it adds nothing to the preconditioner: one direction more costs conjugate gradients an iteration or two.
     """
 
     diagonal = rows = None
@@ -136,6 +151,7 @@ class Cavities:
         self.laws = upload(s.data["law"][first], Law)
         self.volume, self.pressure, self.energy = zeros(wp.float64), zeros(real.scalar), zeros(wp.float64)
         self.reference = zeros(wp.float64)
+        self.held = filled(held(real), self)
         self.stiffness, self._stiffness, self._dots = zeros(real.scalar), zeros(real.scalar), zeros(wp.float64)
         self._parts = zeros(wp.float64, len(s))
         self._volumes = BodySums(device, [number], count)
@@ -155,7 +171,7 @@ class Cavities:
     def measure(self, base: wp.array, u: wp.array) -> None:
         """Launches volumes, pressures and energies at x = base + u."""
         k, device = self._kernels, self.device
-        inputs = [self.vertices, self.number, self.first, base, u, self._parts]
+        inputs = [self.vertices, self.held, base, u, self._parts]
         device.launch(k.part, len(self.vertices), inputs, grain=16)
         self._volumes.add([self._parts], self.volume)
         found = [self.pressure, self._stiffness, self.energy]
@@ -195,7 +211,7 @@ def arguments(device: Device, real: Real, s: ConstraintSet) -> list:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, mat33, Held = real.scalar, real.vec3, real.mat33, held(real)
     module = real.module(__name__)
     edges = tets.functions(real)
     sixth = wp.constant(scalar(1.0 / 6.0))
@@ -214,8 +230,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def part(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
-        number: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=wp.int32),
+        o: Held,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         volume_out: wp.array(dtype=wide),
@@ -223,10 +238,10 @@ def kernels(real: Real) -> SimpleNamespace:
         """Volume between a triangle and the first vertex of its cavity."""
         e = first + wp.tid()
         t = vertices[e]
-        o = origin[number[e]]
-        a = edges.wide_edge(base, u, o, t[0])
-        b = edges.wide_edge(base, u, o, t[1])
-        c = edges.wide_edge(base, u, o, t[2])
+        origin = o.first[o.number[e]]
+        a = edges.wide_edge(base, u, origin, t[0])
+        b = edges.wide_edge(base, u, origin, t[1])
+        c = edges.wide_edge(base, u, origin, t[2])
         volume_out[e] = wp.dot(a, wp.cross(b, c)) / wide(6.0)
 
     @kernel(module)
@@ -249,11 +264,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def force(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
-        number: wp.array(dtype=wp.int32),
-        pressure: wp.array(dtype=scalar),
-        leader: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=wp.int32),
-        cavity_energy: wp.array(dtype=wide),
+        o: Held,
         weight: wp.array(dtype=scalar),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
@@ -262,7 +273,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """q n / 3 at the three corners, n the area along the normal."""
         e = first + wp.tid()
-        f = sixth * pressure[number[e]] * area_normal(base, u, vertices[e])
+        f = sixth * o.pressure[o.number[e]] * area_normal(base, u, vertices[e])
         for c in range(3):
             corners_out[offset + 3 * e + c] = f
 
@@ -270,11 +281,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def energy(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
-        number: wp.array(dtype=wp.int32),
-        pressure: wp.array(dtype=scalar),
-        leader: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=wp.int32),
-        cavity_energy: wp.array(dtype=wide),
+        o: Held,
         weight: wp.array(dtype=scalar),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
@@ -284,18 +291,14 @@ def kernels(real: Real) -> SimpleNamespace:
         """W of a cavity, on its first triangle."""
         e = first + wp.tid()
         energy_out[offset + e] = wide(0.0)
-        if leader[e] >= 0:
-            energy_out[offset + e] = cavity_energy[leader[e]]
+        if o.leader[e] >= 0:
+            energy_out[offset + e] = o.energy[o.leader[e]]
 
     @kernel(module)
     def hessian(
         first: int,
         vertices: wp.array(dtype=wp.vec3i),
-        number: wp.array(dtype=wp.int32),
-        pressure: wp.array(dtype=scalar),
-        leader: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=wp.int32),
-        cavity_energy: wp.array(dtype=wide),
+        o: Held,
         weight: wp.array(dtype=scalar),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
@@ -310,11 +313,11 @@ def kernels(real: Real) -> SimpleNamespace:
             blocks_out[at + k] = mat33()
         if project[0] == 0:
             t = vertices[e]
-            o = origin[number[e]]
-            q = sixth * pressure[number[e]]
-            blocks_out[at + 1] = q * skew(edges.edge(base, u, o, t[2]))
-            blocks_out[at + 2] = -q * skew(edges.edge(base, u, o, t[1]))
-            blocks_out[at + 4] = q * skew(edges.edge(base, u, o, t[0]))
+            first_of_cavity = o.first[o.number[e]]
+            q = sixth * o.pressure[o.number[e]]
+            blocks_out[at + 1] = q * skew(edges.edge(base, u, first_of_cavity, t[2]))
+            blocks_out[at + 2] = -q * skew(edges.edge(base, u, first_of_cavity, t[1]))
+            blocks_out[at + 4] = q * skew(edges.edge(base, u, first_of_cavity, t[0]))
 
     @kernel(module)
     def gather_gradient(
@@ -358,4 +361,13 @@ def kernels(real: Real) -> SimpleNamespace:
         c = cavity[i]
         y[members[i]] = y[members[i]] + scalar(wide(stiffness[c]) * dots[c]) * gradient[i]
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        part=part,
+        judge=judge,
+        force=force,
+        energy=energy,
+        hessian=hessian,
+        gather_gradient=gather_gradient,
+        multiply=multiply,
+        spread=spread,
+    )

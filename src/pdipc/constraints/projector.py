@@ -26,6 +26,7 @@ from pdipc.constraints import (
     triangle_area,
     triangle_strain,
     woven,
+    woven_bending,
 )
 from pdipc.constraints.base import ConstraintSet, merge
 from pdipc.device.language import kernel
@@ -46,6 +47,7 @@ KINDS = (
     strain_limit,
     edge_length,
     quadratic_bending,
+    woven_bending,
     curved_bending,
     enclosed_volume,
     stitch,
@@ -124,7 +126,7 @@ class Projector:
                 self.threads = rest[1]
             if kind is enclosed_volume:
                 c = self.cavities = enclosed_volume.Cavities(device, real, n_vertices, s)
-                rest = [c.number, c.pressure, c.leader, c.first, c.energy]
+                rest = [c.held]
             arrays = [wp.array(s.vertices, dtype=vector, device=device.warp), *rest]
             arrays.append(wp.array(s.weight, dtype=real.scalar, device=device.warp))
             kernels = kind.kernels(real)

@@ -37,10 +37,10 @@ def hinges(triangles: np.ndarray) -> np.ndarray:
 def curvature_rows(rest_positions: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """g (h, 4) and the areas (h,) of both triangles of each hinge, m^2."""
     corners = rest_positions[vertices]
-    return _rows_of_sides(corners[:, :3], corners[:, [0, 1, 3]])
+    return rows_of_sides(corners[:, :3], corners[:, [0, 1, 3]])
 
 
-def _rows_of_sides(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rows_of_sides(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same, from (h, 3, 3) each: the ends of the hinge and the vertex across, as either triangle has them at rest."""
 
     def cotangents(side: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,7 +63,7 @@ def rest(rest_positions: np.ndarray, triangles: np.ndarray, bending_stiffness: f
     if corners is None:
         g, area = curvature_rows(rest_positions, vertices)
     else:
-        g, area = _rows_of_sides(*(_side(triangles, corners, vertices[:, [0, 1, across]]) for across in (2, 3)))
+        g, area = rows_of_sides(*(_side(triangles, corners, vertices[:, [0, 1, across]]) for across in (2, 3)))
     return make_set(NAME, vertices, g[:, None, :], bending_stiffness / area, length=np.zeros(len(vertices)))
 
 

@@ -146,7 +146,7 @@ def positive_stretch(k: Vec3):
 
 @functools.cache
 def functions(real: Real) -> SimpleNamespace:
-    """Deformation gradients of triangles, their columns f1 and f2, in the scene's precision and in double."""
+    """Deformation gradients of triangles, their columns f1 and f2, in the scene's precision and in double; and forces on them."""
     scalar, vec3, mat22 = real.scalar, real.vec3, real.mat22
     edges = tets.functions(real)
     mat23 = wp.types.matrix((2, 3), scalar)
@@ -170,7 +170,16 @@ def functions(real: Real) -> SimpleNamespace:
         f2 = wide(b[0, 1]) * e1 + wide(b[1, 1]) * e2
         return wide23(f1[0], f1[1], f1[2], f2[0], f2[1], f2[2])
 
-    return SimpleNamespace(deformation=deformation, wide_deformation=wide_deformation)
+    @func
+    def hand_out(b: mat22, d1: vec3, d2: vec3, corner: int, corners_out: wp.array(dtype=vec3)):
+        """Forces at three corners from those on the columns of F."""
+        g1 = b[0, 0] * d1 + b[0, 1] * d2
+        g2 = b[1, 0] * d1 + b[1, 1] * d2
+        corners_out[corner] = -(g1 + g2)
+        corners_out[corner + 1] = g1
+        corners_out[corner + 2] = g2
+
+    return SimpleNamespace(deformation=deformation, wide_deformation=wide_deformation, hand_out=hand_out)
 
 
 @functools.cache
@@ -250,12 +259,7 @@ def kernels(real: Real, module: wp.Module, project_of: Callable, principal: Call
         d = project_of(wp.vec3d(f[0, 0], f[0, 1], f[0, 2]), wp.vec3d(f[1, 0], f[1, 1], f[1, 2])) - f
         d1 = weight[e] * vec3(scalar(d[0, 0]), scalar(d[0, 1]), scalar(d[0, 2]))
         d2 = weight[e] * vec3(scalar(d[1, 0]), scalar(d[1, 1]), scalar(d[1, 2]))
-        g1 = b[0, 0] * d1 + b[0, 1] * d2
-        g2 = b[1, 0] * d1 + b[1, 1] * d2
-        corner = offset + 3 * e
-        corners_out[corner] = -(g1 + g2)
-        corners_out[corner + 1] = g1
-        corners_out[corner + 2] = g2
+        f_of.hand_out(b, d1, d2, offset + 3 * e, corners_out)
 
     @kernel(module, "energy")
     def energy(

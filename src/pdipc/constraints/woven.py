@@ -74,12 +74,7 @@ def kernels(real: Real) -> SimpleNamespace:
         p2 = (wide(c[1]) * e2 + wide(c[2]) * e1) / l2 * f2 + shear * f1
         d1 = -weight[e] * vec3(scalar(p1[0]), scalar(p1[1]), scalar(p1[2]))
         d2 = -weight[e] * vec3(scalar(p2[0]), scalar(p2[1]), scalar(p2[2]))
-        g1 = b[0, 0] * d1 + b[0, 1] * d2
-        g2 = b[1, 0] * d1 + b[1, 1] * d2
-        corner = offset + 3 * e
-        corners_out[corner] = -(g1 + g2)
-        corners_out[corner + 1] = g1
-        corners_out[corner + 2] = g2
+        f_of.hand_out(b, d1, d2, offset + 3 * e, corners_out)
 
     @kernel(module, "energy")
     def energy(

@@ -2,11 +2,12 @@
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from pdipc.device import system
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct_of
 from pdipc.device.precision import Real
 from pdipc.integration import status
 
@@ -17,8 +18,36 @@ SIZE = status.COUNTS + 5 + status.NUMBERS + len(status.STAGES)
 
 
 @functools.cache
+def start(real: Real) -> Any:
+    """A struct: where a step starts."""
+    return struct_of(
+        "Start",
+        __name__,
+        x=wp.array(dtype=real.vec3),  # m
+        rest=wp.array(dtype=real.vec3),  # m, what rounding took off x
+        v=wp.array(dtype=real.vec3),  # m/s
+        a=wp.array(dtype=real.vec3),  # m/s^2
+    )
+
+
+@functools.cache
+def inertial(real: Real) -> Any:
+    """A struct: what the potential of inertia and damping takes."""
+    return struct_of(
+        "Inertial",
+        __name__,
+        rest=wp.array(dtype=real.vec3),  # m, displacement at the start
+        z=wp.array(dtype=real.vec3),  # m, inertial displacement
+        mass=wp.array(dtype=real.scalar),  # kg
+        free=wp.array(dtype=real.scalar),
+        h=real.scalar,  # s
+        damping=real.scalar,  # 1/s
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Start, Progress = real.scalar, real.vec3, start(real), status.progress(real)
     module = real.module(__name__)
 
     @kernel(module)
@@ -37,10 +66,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def predict(
         first: int,
-        x: wp.array(dtype=vec3),
-        rest: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        a: wp.array(dtype=vec3),
+        s: Start,
         acceleration: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
@@ -55,59 +81,49 @@ def kernels(real: Real) -> SimpleNamespace:
         positions from outside: where no motion is proven a step ends at x* + rest (`collision.truncation`).
         """
         i = first + wp.tid()
-        own = rest[i]
+        own = s.rest[i]
         for axis in range(3):
-            if x[i][axis] + own[axis] != x[i][axis]:
+            if s.x[i][axis] + own[axis] != s.x[i][axis]:
                 own[axis] = scalar(0.0)
-        rest[i] = own
+        s.rest[i] = own
         u_out[i] = own
         if free[i] > scalar(0.0):
-            inertial = rest[i] + h * v[i]
+            inertial = s.rest[i] + h * s.v[i]
             z_out[i] = inertial + h * h * acceleration[i]
-            u_tilde_out[i] = inertial + scalar(0.25) * h * h * a[i]
+            u_tilde_out[i] = inertial + scalar(0.25) * h * h * s.a[i]
         else:
-            z_out[i] = target[i] - x[i]
-            u_tilde_out[i] = target[i] - x[i]
+            z_out[i] = target[i] - s.x[i]
+            u_tilde_out[i] = target[i] - s.x[i]
 
     @kernel(module)
-    def begin(
-        first: int,
-        count: wp.array(dtype=wp.int32),
-        local_global: wp.array(dtype=wp.int32),
-        linear: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=scalar),
-        going_out: wp.array(dtype=wp.int32),
-    ):
+    def begin(first: int, progress: Progress, local_global_out: wp.array(dtype=wp.int32), linear_out: wp.array(dtype=wp.int32)):
         for i in range(status.COUNTS):
-            count[i] = 0
+            progress.count[i] = 0
         for i in range(status.NUMBERS):
-            numbers[i] = scalar(0.0)
-        local_global[0] = 0
-        linear[0] = 0
-        going_out[0] = 1
+            progress.numbers[i] = scalar(0.0)
+        local_global_out[0] = 0
+        linear_out[0] = 0
+        progress.going[0] = 1
 
     @kernel(module)
     def finish(
         first: int,
-        x_start: wp.array(dtype=vec3),
-        rest_start: wp.array(dtype=vec3),
+        s: Start,
         u: wp.array(dtype=vec3),
         u_velocity: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
         h: scalar,
-        v: wp.array(dtype=vec3),
-        a: wp.array(dtype=vec3),
         rest_out: wp.array(dtype=vec3),
         v_out: wp.array(dtype=vec3),
         a_out: wp.array(dtype=vec3),
     ):
-        """Line 18: v = (x - x*) / h, a = (v - v*) / h; and what rounding took off x."""
+        """Line 18: v = (x - x*) / h, a = (v - v*) / h; and what rounding took off x. u_velocity: the motion that the velocity is of."""
         i = first + wp.tid()
-        velocity = (u_velocity[i] - rest_start[i]) / h
-        a_out[i] = (velocity - v[i]) / h
+        velocity = (u_velocity[i] - s.rest[i]) / h
+        a_out[i] = (velocity - s.v[i]) / h
         v_out[i] = velocity
-        left = (x_start[i] - x[i]) + u[i]
+        left = (s.x[i] - x[i]) + u[i]
         if free[i] == scalar(0.0):
             left = vec3()
         rest_out[i] = left
@@ -115,29 +131,27 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def report(
         first: int,
-        count: wp.array(dtype=wp.int32),
+        progress: Progress,
         local_global: wp.array(dtype=wp.int32),
         linear: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=scalar),
         closest: wp.array(dtype=scalar),
         foreign: wp.array(dtype=wp.int32),
         chords: wp.array(dtype=wp.int32),
-        clock: wp.array(dtype=wp.float64),
         report_out: wp.array(dtype=wp.float64),
     ):
         for i in range(status.COUNTS):
-            report_out[i] = wp.float64(count[i])
+            report_out[i] = wp.float64(progress.count[i])
         report_out[LOCAL_GLOBAL] = wp.float64(local_global[0])
         report_out[LINEAR] = wp.float64(linear[0])
         report_out[FOREIGN] = wp.float64(foreign[0])
         report_out[CHORDS] = wp.float64(chords[0])
         report_out[GAP] = wp.float64(wp.inf)
-        if count[status.BARRIERS] > 0:
+        if progress.count[status.BARRIERS] > 0:
             report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))
         for i in range(status.NUMBERS):
-            report_out[FIRST_NUMBER + i] = wp.float64(numbers[i])
+            report_out[FIRST_NUMBER + i] = wp.float64(progress.numbers[i])
         for stage in range(status.STARTED):
-            report_out[TIMES + stage] = clock[stage]
+            report_out[TIMES + stage] = progress.clock[stage]
 
     milliseconds = system.milliseconds()  # the step is one graph, so its stages are timed where it runs
 
@@ -156,4 +170,12 @@ def kernels(real: Real) -> SimpleNamespace:
         clock[stage] = clock[stage] + now - clock[status.LAST]
         clock[status.LAST] = now
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        compare=compare,
+        predict=predict,
+        begin=begin,
+        finish=finish,
+        report=report,
+        start_clock=start_clock,
+        mark=mark,
+    )

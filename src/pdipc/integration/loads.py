@@ -160,7 +160,7 @@ def kernels(real: Real) -> SimpleNamespace:
             total_rate += rate[members[k]]
         acceleration_out[i] = steady[i] + force / wp.max(inertia[i], scalar(0.5) * inertia[i] + h * total_rate)
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(drag=drag, gather=gather)
 
 
 class Loads:

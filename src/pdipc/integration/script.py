@@ -72,26 +72,49 @@ def ways(real: Real) -> Any:
 
 
 @functools.cache
+def led(real: Real) -> Any:
+    """A struct: the vertices as displaced so far, and where those go that follow a script."""
+    return struct_of(
+        "Led",
+        __name__,
+        base=wp.array(dtype=real.vec3),  # m, where the step starts
+        u=wp.array(dtype=real.vec3),  # m, displacement from there
+        free=wp.array(dtype=real.scalar),
+        target=wp.array(dtype=real.vec3),  # m
+        mover=wp.array(dtype=wp.int32),  # of each vertex, -1 for none
+        drive=wp.array(dtype=wp.int32),  # of each mover, whether it goes on in this outer iteration
+    )
+
+
+@functools.cache
+def march(real: Real) -> Any:
+    """A struct: how far each mover is on its way; see `Script`."""
+    return struct_of(
+        "March",
+        __name__,
+        at=wp.array(dtype=wp.int32),  # number of the waypoint that it goes to, from 1
+        left=wp.array(dtype=real.scalar),  # part of the way there that is left
+        tries=wp.array(dtype=wp.int32),  # outer iterations that it went on in since the last
+        drive=wp.array(dtype=wp.int32),
+        crowded=wp.array(dtype=wp.int32),
+        behind=wp.array(dtype=wp.int32),  # whether it has not come there
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, Ways = real.scalar, real.vec3, ways(real)
+    scalar, vec3, Ways, March = real.scalar, real.vec3, ways(real), march(real)
     module = real.module(__name__)
     zero = wp.constant(scalar(0.0))
 
     @kernel(module)
-    def begin(
-        first: int,
-        at_out: wp.array(dtype=wp.int32),
-        left_out: wp.array(dtype=scalar),
-        tries_out: wp.array(dtype=wp.int32),
-        drive_out: wp.array(dtype=wp.int32),
-        crowded_out: wp.array(dtype=wp.int32),
-    ):
+    def begin(first: int, march_out: March):
         m = first + wp.tid()
-        at_out[m] = 1
-        left_out[m] = scalar(1.0)
-        tries_out[m] = 1
-        drive_out[m] = 1
-        crowded_out[m] = 0
+        march_out.at[m] = 1
+        march_out.left[m] = scalar(1.0)
+        march_out.tries[m] = 1
+        march_out.drive[m] = 1
+        march_out.crowded[m] = 0
 
     @kernel(module)
     def aim(
@@ -158,12 +181,7 @@ def kernels(real: Real) -> SimpleNamespace:
         progress: wp.array(dtype=wp.int32),
         patience: int,
         count: wp.array(dtype=wp.int32),
-        behind: wp.array(dtype=wp.int32),
-        crowded: wp.array(dtype=wp.int32),
-        at: wp.array(dtype=wp.int32),
-        left: wp.array(dtype=scalar),
-        tries: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
+        o: March,
         flags_out: wp.array(dtype=wp.int32),
         chords_out: wp.array(dtype=wp.int32),
     ):
@@ -171,33 +189,33 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(3):
             flags_out[k] = 0
         for m in range(movers):
-            may = crowded[m] == 0 and tries[m] < TRIES and progress[status.SINCE] < patience
+            may = o.crowded[m] == 0 and o.tries[m] < TRIES and progress[status.SINCE] < patience
             goes = int(0)
             under_way = int(1)
-            if behind[m] == 0:
-                left[m] = zero
+            if o.behind[m] == 0:
+                o.left[m] = zero
                 under_way = 0
-                if at[m] < count[m]:
-                    at[m] = at[m] + 1
-                    left[m] = scalar(1.0)
-                    tries[m] = 0
+                if o.at[m] < count[m]:
+                    o.at[m] = o.at[m] + 1
+                    o.left[m] = scalar(1.0)
+                    o.tries[m] = 0
                     under_way = 1
                     flags_out[ARRIVED] = 1
-                    if crowded[m] == 0:
+                    if o.crowded[m] == 0:
                         goes = 1
-            elif drive[m] != 0:
-                left[m] = left[m] * (scalar(1.0) - fraction[leaders[m]])
+            elif o.drive[m] != 0:
+                o.left[m] = o.left[m] * (scalar(1.0) - fraction[leaders[m]])
             elif may:
                 goes = 1
             if under_way != 0:
                 flags_out[AHEAD] = 1
                 if goes != 0 or may:
                     flags_out[WILL] = 1
-            drive[m] = goes
-            tries[m] = tries[m] + goes
-            chords_out[0] = wp.max(chords_out[0], at[m])
+            o.drive[m] = goes
+            o.tries[m] = o.tries[m] + goes
+            chords_out[0] = wp.max(chords_out[0], o.at[m])
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(begin=begin, aim=aim, clear=clear, compare=compare, hold=hold, advance=advance)
 
 
 @dataclass
@@ -304,7 +322,6 @@ class Script:
         held, whole = (np.concatenate([np.zeros(0, dtype=bool), *parts]) for parts in (held, whole))
         self.to_points, self.on_rails = held & whole, held & ~whole
         self._ways: list[Way] = []
-        self._late = ""
         n, count = len(assembly.positions), max(1, len(self.movers))
 
         def zeros(dtype, size=count) -> wp.array:
@@ -316,6 +333,7 @@ class Script:
         self.goal, self.target = zeros(real.vec3, n), zeros(real.vec3, n)
         self.at, self.tries, self.drive, self.crowded, self.behind = (zeros(wp.int32) for _ in range(5))
         self.left, self.flags, self.chords = zeros(real.scalar), zeros(wp.int32, 3), zeros(wp.int32, 1)
+        self.march = filled(march(real), self)
         self.count, self.offset, self.straight, self.bends, self.bend_offset = (zeros(wp.int32) for _ in range(5))
         self.center = zeros(wp.vec3d)
         owner = np.full(n, -1, dtype=np.int32)
@@ -487,17 +505,17 @@ class Script:
             self.corners[: len(corners)].assign(corners.astype(self.real.numpy))
 
     def settle(self, time: float, reached: Reached, lag: float, positions: wp.array) -> tuple[Reached, float, str]:
-        """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and
-        why.
+        """After a step that ended at `time`, s, at positions (n,) vec3: how far everybody is, how far, m, the last is behind its script, and a
+        sentence that names it; nothing where all are in time.
 
         reached: where the step started. lag: m, how far the last is behind the goal of the step.
         """
-        now, why = reached.copy(), "where something is in its way"
+        now = reached.copy()
         now.times[:] = time
         if self.anchors is not None:
             now.anchors = self.anchors.copy()
         if not self.moves:
-            return now, lag, why
+            return now, *self._last(time, now, lag, positions)
         arrived = lag == 0.0
         at, left = (None, None) if arrived else (self.at.numpy(), self.left.numpy())
         for number, (mover, way) in enumerate(zip(self.movers, self._ways, strict=True)):
@@ -512,11 +530,22 @@ class Script:
                 now.poses[mover.body] = *Rotation.from_matrix(rotation).as_quat(), *(p + way.path.center)
             elif not mover.still:
                 now.times[mover.body] = come
-                if way.times[-1] < time:
-                    away = mover.place(time) - positions.numpy()[mover.vertices]
-                    lag = max(lag, float(np.linalg.norm(away, axis=1).max(initial=0.0)))
-                    why = f"and makes it up at {CATCH_UP:g} times its pace"
-        return now, lag, why
+        return now, *self._last(time, now, lag, positions)
+
+    def _last(self, time: float, now: Reached, lag: float, positions: wp.array) -> tuple[float, str]:
+        """How far, m, the last is behind its script, and the sentence that names it, or nothing; see `settle`. now: after the step."""
+        late = [isinstance(way.path, Trajectory) and way.times[-1] < time for way in self._ways]
+        if not (lag > 0.0 or any(late)):
+            return 0.0, ""
+        x, away = positions.numpy(), []
+        for mover, is_late in zip(self.movers, late, strict=True):
+            goal = mover.place(time) if is_late else self._where[mover.vertices]
+            away.append(float(np.linalg.norm(goal.astype(x.dtype) - x[mover.vertices], axis=1).max(initial=0.0)))
+        last = int(np.argmax(away))
+        lag = max(lag, away[last])
+        follows = late[last] and now.times[self.movers[last].body] == self._ways[last].times[-1]
+        why = f"and makes it up at {CATCH_UP:g} times its pace" if follows else "where something is in its way"
+        return lag, f"{self.movers[last].label} is {lag:.3g} m behind its target, {why}"
 
     # Within a step, in launches only.
 
@@ -525,12 +554,19 @@ class Script:
         movers = len(self.movers)
         if movers:
             self.device.launch_serial(self.kernels.clear, [self.chords])
-            self.device.launch(self.kernels.begin, movers, [self.at, self.left, self.tries, self.drive, self.crowded])
+            self.device.launch(self.kernels.begin, movers, [self.march])
             self._aim(x_start)
 
     def hold(self) -> None:
         """Whoever would close a pair that is squeezed where the step starts does not set out: it would squeeze it further with each step."""
         self.device.launch(self.kernels.hold, len(self.movers), [self.crowded, self.drive])
+
+    def led(self, x_start: wp.array, u: wp.array, free: wp.array) -> Any:
+        """All vertices as kernels take them, displaced by u from x_start; free: (n,) 1 or 0."""
+        made = led(self.real)()
+        made.base, made.u, made.free = x_start, u, free
+        made.target, made.mover, made.drive = self.target, self.mover, self.drive
+        return made
 
     def _aim(self, x_start: wp.array) -> None:
         inputs = [self.members, self.mover, self.points, self.at, filled(ways(self.real), self), x_start, self.target]
@@ -543,10 +579,8 @@ class Script:
         k, device = self.kernels, self.device
         device.launch(k.clear, len(self.movers), [self.behind])
         device.launch(k.compare, self.member_count, [self.members, self.mover, x_start, self.target, u, self.behind])
-        states = [self.behind, self.crowded, self.at, self.left, self.tries, self.drive, self.flags, self.chords]
-        device.launch_serial(
-            k.advance, [len(self.movers), self.leaders, fraction, progress, self.patience, self.count, *states]
-        )
+        limits = [fraction, progress, self.patience, self.count]
+        device.launch_serial(k.advance, [len(self.movers), self.leaders, *limits, self.march, self.flags, self.chords])
         self._aim(x_start)
 
 

@@ -1,6 +1,12 @@
 """How a step stands: codes, and places in the arrays that the device keeps and the host reads once a step."""
 
+import functools
+from typing import Any
+
 import warp as wp
+
+from pdipc.device.language import struct_of
+from pdipc.device.precision import Real
 
 STAGES = ("solver", "ccd", "barrier", "misc")
 STARTED, LAST = wp.constant(len(STAGES)), wp.constant(len(STAGES) + 1)  # places of the clock, in milliseconds
@@ -21,3 +27,16 @@ MOVED, FORCE, FORCE_SCALE, LAG, MOVED_BEFORE, MOVED_FREELY, BARRIER_CHANGE, UNBA
     wp.constant(place) for place in range(8)
 )
 NUMBERS = 8
+
+
+@functools.cache
+def progress(real: Real) -> Any:
+    """A struct: how a step stands."""
+    return struct_of(
+        "Progress",
+        __name__,
+        count=wp.array(dtype=wp.int32),
+        numbers=wp.array(dtype=real.scalar),
+        clock=wp.array(dtype=wp.float64),
+        going=wp.array(dtype=wp.int32),  # (1,) whether outer iterations go on
+    )

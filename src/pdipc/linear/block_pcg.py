@@ -11,13 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from pdipc.device.language import Kernel, func, kernel
+from pdipc.device.language import Kernel, filled, func, kernel
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import pcg
 from pdipc.linear.affine import AffineBodies
-from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.blocks import BlockMatrix, rows_of
 from pdipc.linear.contact_rows import ContactRows, nothing
 from pdipc.linear.contact_rows import kernels as row_kernels
 from pdipc.linear.rigid_modes import RigidModes
@@ -73,13 +73,14 @@ class BlockPcg:
         self.device, self.real, self.matrix, self.affine = device, real, matrix, affine
         followers = [] if affine is None else affine.bodies
         self.modes = self.make_modes(free)
-        self.tolerance, self.most = tolerance, most
+        self.tolerance, self.max_iterations = tolerance, most
         self.sums = shared.Sums(device, n)
 
         def zeros(dtype, count: int = n + 1) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device.warp)
 
-        self._r, self._u, self._w, self._p, self._s = (zeros(real.vec3) for _ in range(5))
+        self.r, self.u, self.w, self.p, self.s = (zeros(real.vec3) for _ in range(5))
+        self.vectors = filled(pcg.vectors(real), self)
         self._inverse = zeros(real.mat33)
         self._free = wp.array(free.astype(np.int32), device=device.warp)
         unknown = free.copy()
@@ -87,17 +88,23 @@ class BlockPcg:
             unknown[body.vertices] = False
         self._unknown = wp.array(unknown.astype(np.int32), device=device.warp)
         self._numbers, self._partial = zeros(scalar, 3), zeros(scalar, self.sums.slots)
-        self._first, self._residual = zeros(scalar, 1), zeros(scalar, 1)
-        self.iterations, self._left, self._going = zeros(wp.int32, 1), zeros(wp.int32, 1), zeros(wp.int32, 1)
+        self.first, self.residual = zeros(scalar, 1), zeros(scalar, 1)
+        self.iterations, self.left, self.condition = zeros(wp.int32, 1), zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.indefinite = zeros(wp.int32, 1)
         self._steps = wp.zeros((most, 2), dtype=scalar, device=device.warp)
         self._kernels, self._pcg = kernels(real), pcg.kernels(real)
         self._advance = _advance_kernel(real)
 
+    def status(self, tolerance: float | None) -> Any:
+        """When a solve ends, and how far it has come, as kernels take it."""
+        made = filled(shared.status(self.real), self)
+        made.tolerance = tolerance or self.tolerance
+        return made
+
     @property
     def direction(self) -> wp.array:
         """(n + 1,) vec3: the last direction; where the solve ended as `indefinite`, that of negative curvature."""
-        return self._p
+        return self.p
 
     def make_modes(self, free: np.ndarray) -> RigidModes:
         bodies = [] if self.affine is None else self.affine.bodies
@@ -130,21 +137,18 @@ class BlockPcg:
         tolerated: N^(1/2) m^(1/2), the norm below which a residual is as good as none. loose: (1,) int32 on the device, whether LOOSE times the
         tolerance will do. tolerance: where another one than the solver's own is wanted.
         """
-        k, sums, m = self._kernels, self.sums, self.matrix
+        k, sums, status = self._kernels, self.sums, self.status(tolerance)
         assembled = [c.assemble() for c in couplings if c.rows is not None]
         couplings = [c for c in couplings if c.rows is None]
         assembled += [nothing(self.real)] * (2 - len(assembled))
-        rows = [m.offsets, m.columns, m.values, m.held, *assembled]
-        status = [self._first, self._left, self.iterations, self._residual, self._going]
-        limits = [loose, self.real.scalar(tolerance or self.tolerance), self.most]
 
         def begin(again: int) -> None:
             self._find_residual(p, b, couplings, assembled)
             if self.affine is not None:
-                self.affine.fold(self._r)
+                self.affine.fold(self.r)
             self._precondition()
             numbers = [self._partial, sums.slots, self._numbers, self.real.scalar(tolerated), again]
-            sums.conclude(k.begin, [*numbers, *limits, *status, self.indefinite])
+            sums.conclude(k.begin, [*numbers, loose, status, self.indefinite])
 
         def begin_again() -> None:
             self._move_rigidly(p)
@@ -155,18 +159,18 @@ class BlockPcg:
 
         def iterate() -> None:
             if self.affine is not None:
-                self.affine.expand(self._u)
+                self.affine.expand(self.u)
             for c in couplings:
-                c.apply(self._u, self._w)
-            sums.launch(k.multiply, [*rows, self._free, self._u, self._w, self._partial])
+                c.apply(self.u, self.w)
+            sums.launch(k.multiply, [self.matrix.rows, *assembled, self._free, self.vectors, self._partial])
             if self.affine is not None:
-                self.affine.fold(self._w)
-            sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self._left, self.indefinite])
-            sums.launch(self._advance, [self._numbers, 1, self._w, self._u, self._p, self._s, p, self._r])
+                self.affine.fold(self.w)
+            sums.conclude(k.find_alpha, [self._partial, sums.slots, self._numbers, self.left, self.indefinite])
+            sums.launch(self._advance, [self._numbers, 1, self.vectors, p])
             self._precondition()
-            sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, *limits[1:], *status])
+            sums.conclude(self._pcg.find_beta, [self._partial, sums.slots, self._numbers, self._steps, status])
 
-        self.device.loop(self._going, iterate)
+        self.device.loop(self.condition, iterate)
         self.device.launch_serial(k.judge_preconditioner, [self._numbers, self.indefinite])
         if self.affine is not None:
             self.affine.expand(p)
@@ -174,17 +178,16 @@ class BlockPcg:
     def _find_residual(self, p: wp.array, b: wp.array, couplings: list[Coupling], assembled: list) -> None:
         """r = b - K p. couplings: those without rows; assembled: the rows of two others."""
         k, m = self._kernels, self.matrix
-        self.device.launch(k.clear, m.count, [self._w])
+        self.device.launch(k.clear, m.count, [self.w])
         if self.affine is not None:
             self.affine.expand(p)
         for c in couplings:
-            c.apply(p, self._w)
-        rows = [m.offsets, m.columns, m.values, m.held, *assembled]
-        self.device.launch(k.start, m.count, [*rows, self._free, b, p, self._w, self._r, self._s, self._p], grain=32)
+            c.apply(p, self.w)
+        self.device.launch(k.start, m.count, [m.rows, *assembled, self._free, b, p, self.vectors], grain=32)
 
     def _move_rigidly(self, p: wp.array) -> None:
         """The coarse part of the preconditioned residual alone: what flies freely is solved by that exactly, whatever the tolerance."""
-        self.device.launch(self._kernels.move_rigidly, self.matrix.count, [self._unknown, self._inverse, self._r, self._u, p])
+        self.device.launch(self._kernels.move_rigidly, self.matrix.count, [self._unknown, self._inverse, self.r, self.u, p])
 
     def clear(self, values: wp.array) -> None:
         """Launches values = 0 over the vertices."""
@@ -193,8 +196,8 @@ class BlockPcg:
     def _precondition(self) -> None:
         modes = self.modes
         if modes.groups:
-            modes.restrict(self._r)
-        inputs = [self._inverse, modes.label, modes.arms, modes.z, self._r, self._u, self._partial]
+            modes.restrict(self.r)
+        inputs = [self._inverse, modes.label, modes.arms, modes.z, self.vectors, self._partial]
         self.sums.launch(self._kernels.correct, inputs)
 
 
@@ -211,20 +214,15 @@ def kernels(real: Real) -> SimpleNamespace:
     f = shared.functions(real)
     vec6 = wp.types.vector(6, wp.float64)
     Rows, contact = row_kernels(real).Rows, row_kernels(real).product
+    BlockRows, Status, Vectors = rows_of(real), shared.status(real), pcg.vectors(real)
 
     @func
-    def product(
-        i: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
-        p: wp.array(dtype=vec3),
-    ) -> vec3:
+    def product(i: int, k: BlockRows, p: wp.array(dtype=vec3)) -> vec3:
+        """Row i of K p, without contacts."""
         own = p[i]
-        total = held[i] * own
-        for e in range(offsets[i], offsets[i + 1]):
-            total += values[e] * (p[columns[e]] - own)
+        total = k.held[i] * own
+        for e in range(k.offsets[i], k.offsets[i + 1]):
+            total += k.values[e] * (p[k.columns[e]] - own)
         return total
 
     @kernel(module)
@@ -255,30 +253,22 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def start(
         first: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
+        k: BlockRows,
         rows_a: Rows,
         rows_b: Rows,
         free: wp.array(dtype=wp.int32),
         b: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        w: wp.array(dtype=vec3),
-        r_out: wp.array(dtype=vec3),
-        s_out: wp.array(dtype=vec3),
-        p_out: wp.array(dtype=vec3),
+        v: Vectors,
     ):
         """r = b - K x; w holds what couplings without rows have of K x, and is left zero."""
         i = first + wp.tid()
-        r_out[i] = vec3()
+        v.r[i] = vec3()
         if free[i] == 1:
-            r_out[i] = (
-                b[i] - product(i, offsets, columns, values, held, x) - contact(i, rows_a, x) - contact(i, rows_b, x) - w[i]
-            )
-        w[i] = vec3()
-        s_out[i] = vec3()
-        p_out[i] = vec3()
+            v.r[i] = b[i] - product(i, k, x) - contact(i, rows_a, x) - contact(i, rows_b, x) - v.w[i]
+        v.w[i] = vec3()
+        v.s[i] = vec3()
+        v.p[i] = vec3()
 
     @kernel(module)
     def move_rigidly(
@@ -302,13 +292,7 @@ def kernels(real: Real) -> SimpleNamespace:
         tolerated: scalar,
         again: int,
         loose: wp.array(dtype=wp.int32),
-        tolerance: scalar,
-        most: int,
-        first_out: wp.array(dtype=scalar),
-        left_out: wp.array(dtype=wp.int32),
-        iterations: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        going_out: wp.array(dtype=wp.int32),
+        status: Status,
         indefinite_out: wp.array(dtype=wp.int32),
     ):
         lane = first + wp.tid()
@@ -321,16 +305,16 @@ def kernels(real: Real) -> SimpleNamespace:
             reference = norm
             if loose[0] != 0:
                 reference = scalar(LOOSE) * norm
-            reference = wp.max(reference, tolerated / tolerance)
+            reference = wp.max(reference, tolerated / status.tolerance)
             if again != 0:
-                reference = first_out[0]
-            first_out[0] = reference
-            left_out[0] = most
-            residual_out[0] = norm / reference
+                reference = status.first[0]
+            status.first[0] = reference
+            status.left[0] = status.max_iterations
+            status.residual[0] = norm / reference
             indefinite_out[0] = 0
-            going_out[0] = 0
-            if norm > tolerance * reference or not wp.isfinite(gamma):
-                going_out[0] = 1
+            status.condition[0] = 0
+            if norm > status.tolerance * reference or not wp.isfinite(gamma):
+                status.condition[0] = 1
             if gamma < scalar(0.0):
                 indefinite_out[0] = 1
 
@@ -367,15 +351,11 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
+        k: BlockRows,
         rows_a: Rows,
         rows_b: Rows,
         free: wp.array(dtype=wp.int32),
-        u: wp.array(dtype=vec3),
-        w: wp.array(dtype=vec3),
+        v: Vectors,
         partial_out: wp.array(dtype=scalar),
     ):
         """w = K u, where w holds the part of couplings without rows already, and delta = u . w."""
@@ -384,9 +364,9 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
             total = vec3()
             if free[i] == 1:
-                total = product(i, offsets, columns, values, held, u) + contact(i, rows_a, u) + contact(i, rows_b, u) + w[i]
-            w[i] = total
-            delta += wp.dot(u[i], total)
+                total = product(i, k, v.u) + contact(i, rows_a, v.u) + contact(i, rows_b, v.u) + v.w[i]
+            v.w[i] = total
+            delta += wp.dot(v.u[i], total)
         f.store_sum(delta, worker, partial_out)
 
     @kernel(module)
@@ -398,8 +378,7 @@ def kernels(real: Real) -> SimpleNamespace:
         label: wp.array(dtype=wp.int32),
         arms: wp.array(dtype=vec3),
         z: wp.array(dtype=vec6),
-        r: wp.array(dtype=vec3),
-        u_out: wp.array(dtype=vec3),
+        v: Vectors,
         partial_out: wp.array(dtype=scalar),
     ):
         """u = D^-1 r + Z z, gamma = r . u."""
@@ -409,10 +388,10 @@ def kernels(real: Real) -> SimpleNamespace:
             g = label[i]
             if g >= 0:
                 m = z[g]
-                residual = r[i]
+                residual = v.r[i]
                 turn = vec3(scalar(m[3]), scalar(m[4]), scalar(m[5]))
                 u = inverse[i] * residual + vec3(scalar(m[0]), scalar(m[1]), scalar(m[2])) + wp.cross(turn, arms[i])
-                u_out[i] = u
+                v.u[i] = u
                 gamma += wp.dot(residual, u)
         f.store_sum(gamma, worker, partial_out)
 

@@ -13,15 +13,28 @@ that they have in a symmetric matrix.
 
 import functools
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from pdipc.device.language import kernel
+from pdipc.device.language import filled, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
+
+
+@functools.cache
+def rows_of(real: Real) -> Any:
+    """A struct: the matrix as kernels that multiply with it read it."""
+    return struct_of(
+        "BlockRows",
+        __name__,
+        offsets=wp.array(dtype=wp.int32),
+        columns=wp.array(dtype=wp.int32),
+        values=wp.array(dtype=real.mat33),
+        held=wp.array(dtype=real.scalar),
+    )
 
 
 class Hessians(Protocol):
@@ -38,7 +51,7 @@ class BlockMatrix:
     """offsets (n + 1,), columns (nnz,), values (nnz,) 3x3 on the device: the blocks off the diagonal, rows of free vertices only.
 
     held: (n,) kg/s^2, 0 where not free. diagonal: (n,) 3x3 blocks, the elastic ones with held; filled by `assemble`.
-    pattern: the same pattern as a SciPy matrix, for what groups vertices.
+    pattern: the same pattern as a SciPy matrix, for what groups vertices. rows: what kernels take, of the type `rows_of`.
     """
 
     def __init__(self, device: Device, real: Real, projector: Hessians, held: np.ndarray, free: np.ndarray):
@@ -100,6 +113,7 @@ class BlockMatrix:
         self.values = wp.zeros(self.nnz + 1, dtype=real.mat33, device=device.warp)
         self.diagonal = wp.zeros(n, dtype=real.mat33, device=device.warp)
         self.held = wp.array(np.where(free, held, 0.0), dtype=real.scalar, device=device.warp)
+        self.rows = filled(rows_of(real), self)
         self._unrestrained = wp.clone(self.held)
         self._first, self._middle, self._end, self._places = (upload(each, wp.int32) for each in (first, middle, end, gathered))
         self._mirrors = upload(np.where(mirrored, mirror, -1)[gathered], wp.int32)

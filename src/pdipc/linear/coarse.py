@@ -11,6 +11,7 @@ change, in one thread.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -120,17 +121,15 @@ class TwoLevel(pcg.Pcg):
         inputs = [self.groups, self._profile_starts, self._entries, self._added, self._factor]
         self.device.launch_serial(self._coarse.factorize, inputs)
 
-    def _precondition(self) -> None:
-        inputs = [self._member_starts, self._members, self._r, self._z]
+    def _precondition(self, equation: Any) -> None:
+        inputs = [self._member_starts, self._members, self.r, self._z]
         self.device.launch(self._coarse.restrict, self.groups, inputs, grain=GROUP)
         self.device.launch_serial(self._coarse.solve, [self.groups, self._profile_starts, self._factor, self._z])
-        inputs = [*self.preconditioner, self._label, self._z, self._r, self._u, self.partial]
-        self.sums.launch(self._coarse.correct, inputs)
+        self.sums.launch(self._coarse.correct, [equation, self._label, self._z, self.vectors, self.partial])
 
-    def _update(self, x: wp.array, coupled: int) -> None:
-        vectors = [self._w, self._u, self._p, self._s, x, self._r]
-        self.sums.launch(self._coarse.advance, [self._numbers, coupled, *vectors])
-        self._precondition()
+    def _update(self, equation: Any, x: wp.array, coupled: int) -> None:
+        self.sums.launch(self._coarse.advance, [self._numbers, coupled, self.vectors, x])
+        self._precondition(equation)
 
 
 def _profile(matrix: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
@@ -149,6 +148,7 @@ def _profile(matrix: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
 def kernels(real: Real) -> SimpleNamespace:
     """Kernels over the groups, and the small system."""
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    Equation, Vectors = shared.equation(real), pcg.vectors(real)
     module = real.module(__name__)
     f = shared.functions(real)
     advance_vertices = pcg.functions(real).advance
@@ -231,32 +231,26 @@ def kernels(real: Real) -> SimpleNamespace:
         count: int,
         numbers: wp.array(dtype=scalar),
         coupled: int,
-        w: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        p: wp.array(dtype=vec3),
-        s: wp.array(dtype=vec3),
+        v: Vectors,
         x: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
     ):
         """All vectors one step on (as in pcg.py); w is left zero where contacts will add to it."""
         low = (first + wp.tid()) * share
         high = wp.min(low + share, count)
-        advance_vertices(low, high, numbers[alpha_slot], numbers[beta_slot], w, u, p, s, x, r)
+        advance_vertices(low, high, numbers[alpha_slot], numbers[beta_slot], v, x)
         if coupled != 0:
             for i in range(low, high):
-                w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+                v.w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
 
     @kernel(module)
     def correct(
         first: int,
         share: int,
         count: int,
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
+        k: Equation,
         label: wp.array(dtype=wp.int32),
         z: wp.array(dtype=wp.vec4d),
-        r: wp.array(dtype=vec3),
-        u_out: wp.array(dtype=vec3),
+        v: Vectors,
         partial_out: wp.array(dtype=scalar),
     ):
         """u = D^-1 r + Z z, gamma = r . u."""
@@ -266,11 +260,13 @@ def kernels(real: Real) -> SimpleNamespace:
             g = label[i]
             if g >= 0:
                 shift = z[g]
-                residual = r[i]
-                corrected = f.precondition(i, inverse, inverse_block, residual)
+                residual = v.r[i]
+                corrected = f.precondition(i, k, residual)
                 corrected += vec3(scalar(shift[0]), scalar(shift[1]), scalar(shift[2]))
-                u_out[i] = corrected
+                v.u[i] = corrected
                 gamma += wp.dot(residual, corrected)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(
+        add_contacts=add_contacts, factorize=factorize, solve=solve, restrict=restrict, advance=advance, correct=correct
+    )

@@ -35,7 +35,6 @@ class Direct(Solver):
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         free, n = self._free, self.system.count
@@ -65,7 +64,7 @@ class Direct(Solver):
         solution = start.copy()
         r = right - self._matrix @ start[free] - self._fixed @ start[~self.system.free] - hessian(start)
         first = np.sqrt(np.sum(r * np.einsum("nij,nj->ni", blocks, r)))
-        limit = self.tolerance * (float(reference.numpy()[0]) if reference is not None else first)
+        limit = self.tolerance * first
         norm, done = first, 0
         z = self._inverse(r) if first > 0.0 else r
         p, gamma = z, np.sum(r * z)
@@ -81,9 +80,8 @@ class Direct(Solver):
             gamma, before = np.sum(r * z), gamma
             p = z + gamma / before * p
         x.assign(solution.astype(self.real.numpy))
-        scale = float(reference.numpy()[0]) if reference is not None else first
-        self.first.fill_(scale)
-        self.residual.fill_(norm / scale if scale > 0.0 else 0.0)
+        self.first.fill_(first)
+        self.residual.fill_(norm / first if first > 0.0 else 0.0)
         self.iterations.assign(self.iterations.numpy() + done)
 
     def _blocks(self, contact: Contact | None) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from pdipc.device import blocks, language
-from pdipc.device.language import Kernel, func, kernel
+from pdipc.device.language import Kernel, func, kernel, struct_of
 from pdipc.device.launch import BLOCK, Device
 from pdipc.device.precision import Real
 from pdipc.linear import rows
@@ -62,19 +62,53 @@ class Sums:
 
 
 @functools.cache
+def equation(real: Real) -> Any:
+    """A struct: K x = b, without the part of K that couples the vertices of contacts.
+
+    (K x)_i = held_i x_i + sum_j A_ij (x_j - x_i). A negative `inverse` says that `inverse_block` has it, 0 that the vertex is not free.
+    """
+    return struct_of(
+        "Equation",
+        __name__,
+        rows=rows.entries(real),  # of A, off the diagonal, kg/s^2
+        total=wp.array(dtype=real.scalar),  # A_ii with contacts that are scalars, kg/s^2
+        held=wp.array(dtype=real.scalar),  # sum_j A_ij with them
+        inverse=wp.array(dtype=real.scalar),  # of the diagonal, s^2/kg
+        inverse_block=wp.array(dtype=real.mat33),
+        b=wp.array(dtype=real.vec3),  # N
+    )
+
+
+@functools.cache
+def status(real: Real) -> Any:
+    """A struct: when a solve ends, and how far it has come; see `solver.Solver`."""
+    return struct_of(
+        "Status",
+        __name__,
+        tolerance=real.scalar,
+        max_iterations=int,
+        first=wp.array(dtype=real.scalar),  # (1,) the residual norm that the tolerance refers to
+        left=wp.array(dtype=wp.int32),  # (1,) iterations that are left
+        iterations=wp.array(dtype=wp.int32),  # (1,) done
+        residual=wp.array(dtype=real.scalar),  # (1,) in parts of the first
+        condition=wp.array(dtype=wp.int32),  # (1,) whether to go on
+    )
+
+
+@functools.cache
 def functions(real: Real) -> SimpleNamespace:
     """Warp functions on one vertex, and the two halves of a sum."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, mat33, Equation, Status = real.scalar, real.vec3, real.mat33, equation(real), status(real)
     row_product, row_difference = rows.functions(real).row_product, rows.functions(real).row_difference
     hidden_part = HIDDEN * real.unit_roundoff
     block_total = blocks.total(scalar)
 
     @func
-    def precondition(i: int, inverse: wp.array(dtype=scalar), inverse_block: wp.array(dtype=mat33), r: vec3):
-        """D_i^-1 r; a negative `inverse` says that D_i is a full 3x3 block."""
-        factor = inverse[i]
+    def precondition(i: int, k: Equation, r: vec3):
+        """D_i^-1 r."""
+        factor = k.inverse[i]
         if factor < scalar(0.0):
-            return inverse_block[i] * r
+            return k.inverse_block[i] * r
         return factor * r
 
     @func
@@ -113,52 +147,39 @@ def functions(real: Real) -> SimpleNamespace:
         return block_total(sum_slots(partial, count, lane, wp.block_dim()))
 
     @func
-    def begin_status(
-        gamma: scalar,
-        reference: wp.array(dtype=scalar),
-        tolerance: scalar,
-        max_iterations: int,
-        first_out: wp.array(dtype=scalar),
-        left_out: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        condition_out: wp.array(dtype=wp.int32),
-    ):
+    def begin_status(gamma: scalar, status: Status):
         """What a solve notes before its first iteration, gamma = r . D^-1 r."""
         norm = wp.sqrt(gamma)
-        if reference:
-            first_out[0] = reference[0]
-        else:
-            first_out[0] = norm
-        left_out[0] = max_iterations
+        status.first[0] = norm
+        status.left[0] = status.max_iterations
         residual = scalar(0.0)
-        if first_out[0] > scalar(0.0):
-            residual = norm / first_out[0]
-        condition_out[0] = wp.where(residual > tolerance, 1, 0)
+        if norm > scalar(0.0):
+            residual = scalar(1.0)
+        status.condition[0] = wp.where(residual > status.tolerance, 1, 0)
         if not wp.isfinite(gamma):  # one iteration carries it into x, where the step sees it
             residual = gamma
-            condition_out[0] = 1
-        residual_out[0] = residual
+            status.condition[0] = 1
+        status.residual[0] = residual
 
     @func
-    def update_status(
-        gamma: scalar,
-        done: int,
-        counted: int,
-        tolerance: scalar,
-        first_norm: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        iterations: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        condition_out: wp.array(dtype=wp.int32),
-    ):
+    def update_status(gamma: scalar, done: int, counted: int, status: Status):
         """What a solve notes after `done` more steps towards its limit, which count as `counted` iterations."""
-        residual = wp.sqrt(gamma) / first_norm[0]
-        residual_out[0] = residual
-        iterations[0] = iterations[0] + counted
-        left[0] = left[0] - done
-        condition_out[0] = wp.where(residual > tolerance and left[0] > 0, 1, 0)
+        residual = wp.sqrt(gamma) / status.first[0]
+        status.residual[0] = residual
+        status.iterations[0] = status.iterations[0] + counted
+        status.left[0] = status.left[0] - done
+        status.condition[0] = wp.where(residual > status.tolerance and status.left[0] > 0, 1, 0)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(
+        row_product=row_product,
+        row_difference=row_difference,
+        precondition=precondition,
+        invert=invert,
+        store_sum=store_sum,
+        sum_partials=sum_partials,
+        begin_status=begin_status,
+        update_status=update_status,
+    )
 
 
 @functools.cache
@@ -213,4 +234,4 @@ def kernels(real: Real) -> SimpleNamespace:
         held_out[i] = held
         inverse_out[i] = inverse
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(clear=clear, copy=copy, invert_diagonal=invert_diagonal)

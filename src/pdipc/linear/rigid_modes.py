@@ -14,6 +14,7 @@ vectors a and b, (a + b)(a + b)^T <= 2 a a^T + 2 b b^T.
 import functools
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,12 +22,12 @@ import warp as wp
 from scipy.sparse import csgraph
 
 from pdipc.device import language
-from pdipc.device.language import func, kernel
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 from pdipc.linear import partition
 from pdipc.linear.affine import Follower
-from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.blocks import BlockMatrix, rows_of
 
 GROUP = 64  # vertices of a group
 DENSE = 48  # groups up to which C is dense
@@ -88,10 +89,25 @@ _SOLVE = """
 """
 
 
+@functools.cache
+def layout_of(real: Real) -> Any:
+    """A struct: the groups as kernels that add to C read them."""
+    return struct_of(
+        "Layout",
+        __name__,
+        groups=int,
+        starts=wp.array(dtype=wp.int32),  # of each group, in
+        members=wp.array(dtype=wp.int32),  # vertices
+        label=wp.array(dtype=wp.int32),
+        low=wp.array(dtype=wp.int32),  # of each group, the first that its row of C has
+        arms=wp.array(dtype=real.vec3),
+    )
+
+
 class RigidModes:
     """label: (n,) each vertex's group, -1 where not free. arms: (n,) position in the group from its centre over its radius, so that the
-    motion (t, r) of a group moves vertex i by t + r x arm_i. z: (groups,) the six numbers of each group. layout: what kernels over the groups
-    that add to c take first. bodies: those that move as four points do.
+    motion (t, r) of a group moves vertex i by t + r x arm_i. z: (groups,) the six numbers of each group. layout: the groups as kernels take
+    them, of the type `layout_of`. bodies: those that move as four points do.
     """
 
     wide = False  # how the work is cut: see `wide_modes`
@@ -140,14 +156,14 @@ class RigidModes:
         self.arms = zeros(real.vec3, matrix.count)
         self.c, self.inverse = zeros(wp.float64, size * size), zeros(wp.float64, size)
         self.z = zeros(wp.types.vector(MODES, wp.float64), self.groups)
-        self.layout = [self.starts, self.members, self.label, self.low, self.groups, self.arms]
+        self.layout = filled(layout_of(real), self)
         self._kernels = kernels(real)
 
     def prepare(self, x: wp.array, contacts: list) -> None:
         """Launches the factorization of C at the positions x. contacts: what adds to K, each with `couple(self)`."""
         k, device, m = self._kernels, self.device, self.matrix
         device.launch(k.center, self.groups, [self.starts, self.members, x, self.arms], grain=GROUP)
-        device.launch(k.gather, self.groups, [*self.layout, m.offsets, m.columns, m.values, m.held, self.c], grain=16 * GROUP)
+        device.launch(k.gather, self.groups, [self.layout, m.rows, self.c], grain=16 * GROUP)
         for contact in contacts:
             contact.couple(self)
         device.launch_serial(k.factorize, [self.groups, self.low, self.c, self.inverse])
@@ -204,7 +220,7 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, Layout, BlockRows = real.scalar, real.vec3, layout_of(real), rows_of(real)
     module = real.module(__name__)
     f = functions(real)
     vec6 = f.vec6
@@ -260,47 +276,34 @@ def kernels(real: Real) -> SimpleNamespace:
                 c[below + 3 + j] = c[below + 3 + j] + rr[i, j]
 
     @kernel(module)
-    def gather(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        low: wp.array(dtype=wp.int32),
-        groups: int,
-        arms: wp.array(dtype=vec3),
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
-        c: wp.array(dtype=wide),
-    ):
+    def gather(first: int, o: Layout, matrix: BlockRows, c: wp.array(dtype=wide)):
         """The rows of C of a group: sum over its vertices i of Z_i^T (held_i Z_i + sum_j K_ij (Z_j - Z_i)), the lower triangle."""
         g = first + wp.tid()
-        size = MODES * groups
+        size = MODES * o.groups
         for i in range(MODES):
-            for j in range(MODES * low[g], MODES * (g + 1)):
+            for j in range(MODES * o.low[g], MODES * (g + 1)):
                 c[(MODES * g + i) * size + j] = wide(0.0)
         tt = wide33()
         tr = wide33()
         rt = wide33()
         rr = wide33()
         identity = wide33(wp.identity(n=3, dtype=wide))
-        for m in range(starts[g], starts[g + 1]):
-            i = members[m]
+        for m in range(o.starts[g], o.starts[g + 1]):
+            i = o.members[m]
             # Z_i = [I, -[arm]x]; its transpose is [I; [arm]x]
-            own = f.skew(arms[i])
-            mass = wide(held[i])
+            own = f.skew(o.arms[i])
+            mass = wide(matrix.held[i])
             tt += mass * identity
             tr -= mass * own
             rt += mass * own
             rr -= mass * (own * own)
-            for e in range(offsets[i], offsets[i + 1]):
-                j = columns[e]
-                h = label[j]
-                k = f.widened(values[e])
+            for e in range(matrix.offsets[i], matrix.offsets[i + 1]):
+                j = matrix.columns[e]
+                h = o.label[j]
+                k = f.widened(matrix.values[e])
                 if h == g:
                     # translations cancel, rotations leave the difference of the arms
-                    turned = k * (own - f.skew(arms[j]))
+                    turned = k * (own - f.skew(o.arms[j]))
                     tr += turned
                     rr += own * turned
                 else:
@@ -310,8 +313,8 @@ def kernels(real: Real) -> SimpleNamespace:
                     tr += turned
                     rt -= lever
                     rr += own * turned
-                    if h >= low[g] and h < g:
-                        far = f.skew(arms[j])
+                    if h >= o.low[g] and h < g:
+                        far = f.skew(o.arms[j])
                         kf = k * far
                         add_block(c, size, g, h, k, -kf, lever, -(own * kf))
         add_block(c, size, g, g, tt, tr, rt, rr)

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from pdipc.device.language import filled
 from pdipc.linear import kernels
 from pdipc.linear.system import System
 
@@ -34,7 +35,7 @@ class Solver:
     max_iterations: or after so many iterations.
     iterations: (1,) int32 on the device, iterations done since the caller last set it to zero.
     residual: (1,) on the device, the last solve's residual norm relative to `first`.
-    first: (1,) on the device, the residual norm that the tolerance of the last solve referred to, N/sqrt(kg/s^2).
+    first: (1,) on the device, the residual norm at the start of the last solve, N/sqrt(kg/s^2).
     moves_bodies: whether a few iterations find the common motion of a stiff body; else see translations.py.
     recordable: whether `solve` may be called inside `device.capture`.
     dropped: largest part of a row of the iteration matrix that was left out; 0 for all but A-Jacobi with `drop` or `split`.
@@ -51,7 +52,6 @@ class Solver:
             raise ValueError(f"solver max_iterations is {max_iterations}; it must be at least 1")
         self.system, self.device, self.real = system, system.device, system.real
         self.tolerance, self.max_iterations = tolerance, max_iterations
-        self.limits = [self.real.scalar(tolerance), max_iterations]
         self.sums = kernels.Sums(self.device, system.count)
         scalar = self.real.scalar
         self.iterations, self.residual, self.first = self.zeros(wp.int32, 1), self.zeros(scalar, 1), self.zeros(scalar, 1)
@@ -59,8 +59,19 @@ class Solver:
         self.partial = self.zeros(scalar, self.sums.slots)
         self.total, self.held = self.zeros(scalar), self.zeros(scalar)
         self.inverse, self.inverse_block = self.zeros(scalar), self.zeros(self.real.mat33)
-        self.preconditioner = [self.inverse, self.inverse_block]
         self._shared = kernels.kernels(self.real)
+
+    @property
+    def status(self) -> Any:
+        """When a solve ends, and how far it has come, as kernels take it."""
+        return filled(kernels.status(self.real), self)
+
+    def equation(self, b: wp.array) -> Any:
+        """K x = b without coupled contacts, as kernels take it."""
+        made = kernels.equation(self.real)()
+        made.rows, made.total, made.held, made.b = self.system.rows.operand, self.total, self.held, b
+        made.inverse, made.inverse_block = self.inverse, self.inverse_block
+        return made
 
     def prepare(self, contact: Contact | None) -> None:
         """Launches what depends on A and the contacts alone, not on x and b."""
@@ -75,14 +86,12 @@ class Solver:
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         """Launches the solution of K x = b.
 
         x: (n,) vec3, m; the start on entry, the solution on return; entries that are not free stay as they are.
         b: (n,) vec3, N.
-        reference: (1,) on the device, the residual norm that the tolerance refers to, instead of the one at the start.
         prepared: whether `prepare` was called since the contacts last changed; otherwise solve does that itself.
         """
         raise NotImplementedError

@@ -13,26 +13,45 @@ import functools
 import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
 from pdipc.device import blocks
-from pdipc.device.language import Kernel, func, kernel
+from pdipc.device.language import Kernel, filled, func, kernel, struct_of
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device, Span
 from pdipc.device.precision import Real
 from pdipc.linear import rigid_modes
-from pdipc.linear.blocks import BlockMatrix
-from pdipc.linear.rigid_modes import LOST, MODES, RigidModes
+from pdipc.linear.blocks import BlockMatrix, rows_of
+from pdipc.linear.contact_rows import first_entry
+from pdipc.linear.rigid_modes import LOST, MODES, RigidModes, layout_of
 
 SHARES = 32  # threads that share a row of C in an elimination: each solves with the pivot, which takes longer than its part of the row
+
+
+@functools.cache
+def cut_of(real: Real) -> Any:
+    """A struct: the groups' vertices, cut into chunks, as kernels read them; see `WideModes`."""
+    return struct_of(
+        "Cut",
+        __name__,
+        groups=int,
+        chunks=int,
+        chunk_starts=wp.array(dtype=wp.int32),
+        chunk_group=wp.array(dtype=wp.int32),
+        members=wp.array(dtype=wp.int32),
+        arms=wp.array(dtype=real.vec3),
+        solved=wp.array(dtype=wp.float64),
+        sums=wp.array(dtype=wp.types.vector(MODES, wp.float64)),
+    )
 
 
 class WideModes(RigidModes):
     """The groups' vertices are cut into chunks, a block of threads each. chunk_starts: (chunks + 1,) into `members`; chunk_group:
     (chunks,); sums: (chunks,) the part of each in Z^T r. solved: (size * size,) C^-1 after `prepare`. near: (groups^2,) whether a pair of
-    contact connects two groups.
+    contact connects two groups. cut: all this as kernels take it, of the type `cut_of`.
     """
 
     wide = True
@@ -71,14 +90,14 @@ class WideModes(RigidModes):
         self._other, self._lead = zeros(wp.float64, size * size), zeros(wp.float64, size)
         self.near = zeros(wp.int32, self.groups**2)
         self.solved = self._other if self.groups % 2 else self.c
+        self.cut = filled(cut_of(real), self)
         self._wide = kernels(real)
 
     def prepare(self, x: wp.array, contacts: list) -> None:
         k, device, m, groups = self._wide, self.device, self.matrix, self.groups
         device.launch_blocks(k.center, groups, [self.starts, self.members, x, self.arms])
-        layout = [self.starts, self.members, self.label, groups, self.arms, self._bounds, self._rows, self._entries]
-        matrix = [m.offsets, m.columns, m.values, m.held]
-        device.launch_blocks(k.gather, groups**2, [*layout, *matrix, self.c, self.near])
+        between = [self._bounds, self._rows, self._entries]
+        device.launch_blocks(k.gather, groups**2, [self.layout, *between, m.rows, self.c, self.near])
         for contact in contacts:
             contact.couple(self)
         device.launch(k.lead, MODES * groups, [MODES * groups, self.c, self._lead])
@@ -87,11 +106,10 @@ class WideModes(RigidModes):
             device.launch(k.eliminate, MODES * groups * SHARES, [groups, SHARES, pivot, self._lead, here, there])
             here, there = there, here
 
-    def couple(self, kernel: Kernel, count: wp.array, capacity: int, inputs: list) -> None:
-        """Launches a kernel of `coupling` over all pairs of groups that pairs in contact connect: `count` of them, in inputs[2]."""
-        self.device.launch_list(self._wide.mark, capacity, [count, inputs[2], self.label, self.groups, self.near])
-        layout = [self.starts, self.members, self.label, self.groups, self.arms, self.near]
-        self.device.launch_blocks(kernel, self.groups**2, [*layout, *inputs, self.c])
+    def couple(self, kernel: Kernel, operand: Any, capacity: int) -> None:
+        """Launches a kernel of `coupling` over all pairs of groups that pairs in contact connect: those of the operand, at most `capacity`."""
+        self.device.launch_list(self._wide.mark, capacity, [operand.count, operand.quads, self.label, self.groups, self.near])
+        self.device.launch_blocks(kernel, self.groups**2, [self.layout, self.near, operand, self.c])
 
     def restrict(self, r: wp.array) -> None:
         """Launches the sums Z^T r, chunk by chunk."""
@@ -147,7 +165,7 @@ def functions(real: Real) -> SimpleNamespace:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, Layout, BlockRows = real.scalar, real.vec3, layout_of(real), rows_of(real)
     wide, wide33 = wp.float64, wp.mat33d
     module = real.module(__name__)
     f = functions(real)
@@ -188,26 +206,19 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        groups: int,
-        arms: wp.array(dtype=vec3),
+        o: Layout,
         bounds: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
+        matrix: BlockRows,
         c: wp.array(dtype=wide),
         near_out: wp.array(dtype=wp.int32),
     ):
         """C_gh = sum over the vertices i of g of Z_i^T (held_i Z_i + sum_j K_ij (Z_j - Z_i)), elastic; see `rigid_modes`."""
         worker = first + wp.tid()
         lane = worker % wp.block_dim()
-        g = (worker // wp.block_dim()) // groups
-        h = (worker // wp.block_dim()) % groups
+        g = (worker // wp.block_dim()) // o.groups
+        h = (worker // wp.block_dim()) % o.groups
         if h > g:
             return
         tt = wide33()
@@ -216,20 +227,20 @@ def kernels(real: Real) -> SimpleNamespace:
         rr = wide33()
         if h == g:
             identity = wide33(wp.identity(n=3, dtype=wide))
-            for m in range(starts[g] + lane, starts[g + 1], wp.block_dim()):
-                i = members[m]
-                own = f.skew(arms[i])
-                mass = wide(held[i])
+            for m in range(o.starts[g] + lane, o.starts[g + 1], wp.block_dim()):
+                i = o.members[m]
+                own = f.skew(o.arms[i])
+                mass = wide(matrix.held[i])
                 tt += mass * identity
                 tr -= mass * own
                 rt += mass * own
                 rr -= mass * (own * own)
-                for e in range(offsets[i], offsets[i + 1]):
-                    j = columns[e]
-                    k = f.widened(values[e])
-                    if label[j] == g:
+                for e in range(matrix.offsets[i], matrix.offsets[i + 1]):
+                    j = matrix.columns[e]
+                    k = f.widened(matrix.values[e])
+                    if o.label[j] == g:
                         # translations cancel, rotations leave the difference of the arms
-                        turned = k * (own - f.skew(arms[j]))
+                        turned = k * (own - f.skew(o.arms[j]))
                         tr += turned
                         rr += own * turned
                     else:
@@ -239,23 +250,23 @@ def kernels(real: Real) -> SimpleNamespace:
                         rt -= own * k
                         rr += own * turned
         else:
-            pair = g * groups + h
+            pair = g * o.groups + h
             for n in range(bounds[pair] + lane, bounds[pair + 1], wp.block_dim()):
                 i = rows[n]
-                j = columns[entries[n]]
-                k = f.widened(values[entries[n]])
-                own = f.skew(arms[i])
-                far = f.skew(arms[j])
+                j = matrix.columns[entries[n]]
+                k = f.widened(matrix.values[entries[n]])
+                own = f.skew(o.arms[i])
+                far = f.skew(o.arms[j])
                 tt += k
                 tr -= k * far
                 rt += own * k
                 rr -= own * (k * far)
-        if h == g or bounds[g * groups + h + 1] > bounds[g * groups + h]:
+        if h == g or bounds[g * o.groups + h + 1] > bounds[g * o.groups + h]:
             tt = f.of_block(tt)
             tr = f.of_block(tr)
             rt = f.of_block(rt)
             rr = f.of_block(rr)
-        size = MODES * groups
+        size = MODES * o.groups
         for n in range(lane, MODES * MODES, wp.block_dim()):
             i = n // MODES
             j = n % MODES
@@ -264,7 +275,7 @@ def kernels(real: Real) -> SimpleNamespace:
             if g != h:
                 c[(MODES * h + j) * size + MODES * g + i] = value
         if lane == 0:
-            near_out[g * groups + h] = 0
+            near_out[g * o.groups + h] = 0
 
     @kernel(module)
     def mark(
@@ -380,55 +391,38 @@ def kernels(real: Real) -> SimpleNamespace:
     return SimpleNamespace(center=center, gather=gather, mark=mark, lead=lead, eliminate=eliminate, restrict=restrict)
 
 
-def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type, second_type: type) -> Kernel:
+def coupling(real: Real, module: wp.Module, operand: Any, block_of: Callable) -> Kernel:
     """A kernel that adds the Hessians of pairs to C, a block of threads a pair of groups.
 
-    block_of(k, s, t, a, b): a Warp function, the 3x3 block of pair k between its vertices s and t, in double precision, from two arrays
-    of what each pair has.
+    block_of(o, k, s, t): a Warp function, the 3x3 block of pair k between its vertices s and t, in double precision; operand: the type of o,
+    which has `quads`, `ends` and `entries` as for `contact_rows.assembly`.
     """
-    f, vec3 = functions(real), real.vec3
+    f, Layout = functions(real), layout_of(real)
     wide, wide33 = wp.float64, wp.mat33d
 
     @kernel(module)
-    def couple_groups(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        groups: int,
-        arms: wp.array(dtype=vec3),
-        near: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        a: wp.array(dtype=first_type),
-        b: wp.array(dtype=second_type),
-        c: wp.array(dtype=wide),
-    ):
+    def couple_groups(first: int, of: Layout, near: wp.array(dtype=wp.int32), o: operand, c: wp.array(dtype=wide)):
         worker = first + wp.tid()
         lane = worker % wp.block_dim()
-        g = (worker // wp.block_dim()) // groups
-        h = (worker // wp.block_dim()) % groups
-        if h > g or near[g * groups + h] == 0:
+        g = (worker // wp.block_dim()) // of.groups
+        h = (worker // wp.block_dim()) % of.groups
+        if h > g or near[g * of.groups + h] == 0:
             return
         tt = wide33()
         tr = wide33()
         rt = wide33()
         rr = wide33()
-        for m in range(starts[g] + lane, starts[g + 1], wp.block_dim()):
-            v = members[m]
-            begin = int(0)
-            if v > 0:
-                begin = ends[v - 1]
-            for e in range(begin, ends[v]):
-                k = entries[e] // 4
-                s = entries[e] % 4
+        for m in range(of.starts[g] + lane, of.starts[g + 1], wp.block_dim()):
+            v = of.members[m]
+            for e in range(first_entry(v, o.ends), o.ends[v]):
+                k = o.entries[e] // 4
+                s = o.entries[e] % 4
                 for t in range(4):
-                    i = quads[k][t]
-                    if label[i] == h:
-                        block = block_of(k, s, t, a, b)
-                        own = f.skew(arms[v])
-                        turned = block * f.skew(arms[i])
+                    i = o.quads[k][t]
+                    if of.label[i] == h:
+                        block = block_of(o, k, s, t)
+                        own = f.skew(of.arms[v])
+                        turned = block * f.skew(of.arms[i])
                         tt += block
                         tr -= turned
                         rt += own * block
@@ -437,6 +431,6 @@ def coupling(real: Real, module: wp.Module, block_of: Callable, first_type: type
         tr = f.of_block(tr)
         rt = f.of_block(rt)
         rr = f.of_block(rr)
-        f.add(lane, groups, g, h, tt, tr, rt, rr, c)
+        f.add(lane, of.groups, g, h, tt, tr, rt, rr, c)
 
     return couple_groups

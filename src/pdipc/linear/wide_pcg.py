@@ -19,15 +19,15 @@ import numpy as np
 import warp as wp
 
 from pdipc.device import blocks
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct_of
 from pdipc.device.launch import BLOCK, WIDE_BLOCKS, Device
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
-from pdipc.linear import rigid_modes
+from pdipc.linear import pcg, rigid_modes
 from pdipc.linear.block_pcg import BlockPcg, Coupling
-from pdipc.linear.blocks import BlockMatrix
+from pdipc.linear.blocks import BlockMatrix, rows_of
 from pdipc.linear.contact_rows import nothing
-from pdipc.linear.wide_modes import WideModes
+from pdipc.linear.wide_modes import WideModes, cut_of
 from pdipc.linear.wide_modes import functions as mode_functions
 
 PAIR_BLOCKS = 264  # blocks of threads that share the pairs of contacts, at most: two on each multiprocessor of an H100
@@ -90,22 +90,17 @@ class WidePcg(BlockPcg):
         loose: wp.array,
         tolerance: float | None = None,
     ) -> None:
-        k, wide, device, m, modes = self._kernels, self._wide, self.device, self.matrix, self.modes
-        rows = [m.offsets, m.columns, m.values, m.held]
-        tolerance = self.real.scalar(tolerance or self.tolerance)
+        k, wide, device, modes, status = self._kernels, self._wide, self.device, self.modes, self.status(tolerance)
         if not modes.chunks:
             return
-        solved = [modes.groups, modes.chunks, modes.chunk_starts, modes.chunk_group, modes.members, modes.arms, modes.solved]
-        correction = [*solved, modes.sums, self._inverse, self._r, self._u, self._gamma]
-        status = [self._first, self._left, self.iterations, self._residual, self._going]
-        limits = [loose, tolerance, self.most]
+        correction = [modes.cut, self._inverse, self.vectors, self._gamma]
         numbers = [self._gamma, modes.chunks, self._numbers, self.real.scalar(tolerated)]
 
         def begin(again: int) -> None:
             self._find_residual(p, b, couplings, [nothing(self.real)] * 2)
-            modes.restrict(self._r)
+            modes.restrict(self.r)
             device.launch_blocks(wide.correct, modes.chunks, [self._flags, -1, *correction])
-            device.launch_blocks(k.begin, 1, [*numbers, again, *limits, *status, self.indefinite])
+            device.launch_blocks(k.begin, 1, [*numbers, again, loose, status, self.indefinite])
 
         def begin_again() -> None:
             self._move_rigidly(p)
@@ -113,40 +108,41 @@ class WidePcg(BlockPcg):
 
         begin(again=0)
         device.when(loose, begin_again)
-        device.launch(wide.begin, 1, [self._going, self._left, self._flags])
+        device.launch(wide.begin, 1, [self.condition, self.left, self._flags])
 
+        coupled = wide.Contacts()
         operands = [o for c in couplings if (o := c.operand()) is not None]
         others = [c for c in couplings if c.operand() is None]
-        kinds, beside = len(operands), int(len(others) > 0)
-        operands += [o.Operand() for o in self._operators[kinds:]]
+        coupled.kinds, coupled.beside = len(operands), int(len(others) > 0)
+        coupled.a, coupled.b = [*operands, *(o.Operand() for o in self._operators[len(operands) :])]
         room = max((c.capacity for c in couplings if c.operand() is not None), default=0)
-        pair_blocks = min(PAIR_BLOCKS, -(-room // BLOCK))
-        slots = self._row_blocks + pair_blocks
-        product = [modes.members, self._vertices, self._row_blocks, pair_blocks, *rows, self._u, kinds, *operands, beside]
-        vectors = [self._w, self._u, self._p, self._s, p, self._r]
-        chunks = [modes.chunk_starts, modes.members, modes.arms]
-        sums = [self._gamma, modes.chunks, self._delta, slots]
-        told = [tolerance, self._first, self.iterations, self._residual, self.indefinite, self._going]
+        share = wide.Share()
+        share.members, share.vertices = modes.members, self._vertices
+        share.row_blocks, share.pair_blocks = self._row_blocks, min(PAIR_BLOCKS, -(-room // BLOCK))
+        slots = share.row_blocks + share.pair_blocks
+        state = wide.State()
+        state.flags, state.numbers, state.indefinite = self._flags, self._pair, self.indefinite
+        state.gamma, state.delta, state.slots = self._gamma, self._delta, slots
 
         def iterate() -> None:
             for turn in range(TURN):
                 old, new = turn % 2, 1 - turn % 2
                 for c in others:
-                    c.apply(self._u, self._w)
-                device.launch_blocks(wide.multiply, slots, [self._flags, old, *product, self._w, self._delta])
-                state = [self._flags, self._pair, old, new]
-                both = [kinds, *operands, beside]
-                device.launch_blocks(wide.advance, modes.chunks, [*state, *sums, *told, *chunks, *both, *vectors, modes.sums])
+                    c.apply(self.u, self.w)
+                product = [self._flags, old, share, self.matrix.rows, coupled, self.vectors, self._delta]
+                device.launch_blocks(wide.multiply, slots, product)
+                inputs = [old, state, status, modes.cut, coupled, self.vectors, p]
+                device.launch_blocks(wide.advance, modes.chunks, inputs)
                 device.launch_blocks(wide.correct, modes.chunks, [self._flags, new, *correction])
 
-        device.loop(self._going, iterate)
+        device.loop(self.condition, iterate)
 
 
 @functools.cache
 def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNamespace:
     scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
-    wide = wp.float64
     module = real.module(__name__)
+    BlockRows, Vectors, Status, Cut = rows_of(real), pcg.vectors(real), shared.status(real), cut_of(real)
     f, of_modes = shared.functions(real), mode_functions(real)
     mode, vec6, block_sum = rigid_modes.functions(real).mode, of_modes.vec6, of_modes.block_sum
     modes, block_total = rigid_modes.MODES, blocks.total(scalar)
@@ -156,6 +152,33 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
     from pdipc.linear import block_pcg
 
     row_product = block_pcg.kernels(real).product
+
+    Contacts = struct_of(
+        "Contacts",
+        __name__,
+        kinds=int,  # of contacts that there are
+        beside=int,  # whether other couplings have put their parts into w
+        a=First,
+        b=Second,
+    )
+    Share = struct_of(
+        "Share",
+        __name__,
+        members=wp.array(dtype=wp.int32),
+        vertices=int,
+        row_blocks=int,  # blocks of threads that have rows of the matrix,
+        pair_blocks=int,  # and pairs
+    )
+    State = struct_of(
+        "State",
+        __name__,
+        flags=wp.array(dtype=wp.int32),  # both kept twice
+        numbers=wp.array(dtype=scalar),
+        gamma=wp.array(dtype=scalar),  # partial sums, of chunks
+        delta=wp.array(dtype=scalar),  # and of `slots` blocks
+        slots=int,
+        indefinite=wp.array(dtype=wp.int32),
+    )
 
     @kernel(module)
     def begin(first: int, going: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32), flags_out: wp.array(dtype=wp.int32)):
@@ -168,20 +191,10 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         first: int,
         flags: wp.array(dtype=wp.int32),
         turn: int,
-        members: wp.array(dtype=wp.int32),
-        vertices: int,
-        row_blocks: int,
-        pair_blocks: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
-        held: wp.array(dtype=scalar),
-        u: wp.array(dtype=vec3),
-        kinds: int,
-        a: First,
-        b: Second,
-        beside: int,
-        w: wp.array(dtype=vec3),
+        share: Share,
+        matrix: BlockRows,
+        contacts: Contacts,
+        v: Vectors,
         delta_out: wp.array(dtype=scalar),
     ):
         """Some blocks of threads have rows of the matrix, the others have pairs."""
@@ -190,23 +203,23 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         if flags[FLAGS * turn + GOING] == 0:
             return
         delta = scalar(0.0)
-        if block < row_blocks:
-            for m in range(worker, vertices, row_blocks * wp.block_dim()):
-                i = members[m]
-                product = row_product(i, offsets, columns, values, held, u)
-                if beside != 0:
-                    product += w[i]
-                w[i] = product
-                delta += wp.dot(u[i], product)
+        if block < share.row_blocks:
+            for m in range(worker, share.vertices, share.row_blocks * wp.block_dim()):
+                i = share.members[m]
+                product = row_product(i, matrix, v.u)
+                if contacts.beside != 0:
+                    product += v.w[i]
+                v.w[i] = product
+                delta += wp.dot(v.u[i], product)
         else:
-            begin = worker - row_blocks * wp.block_dim()
-            step = pair_blocks * wp.block_dim()
-            if kinds > 0:
-                for k in range(begin, a.count[0], step):
-                    delta += feel_first(a, k, u)
-            if kinds > 1:
-                for k in range(begin, b.count[0], step):
-                    delta += feel_second(b, k, u)
+            begin = worker - share.row_blocks * wp.block_dim()
+            step = share.pair_blocks * wp.block_dim()
+            if contacts.kinds > 0:
+                for k in range(begin, contacts.a.count[0], step):
+                    delta += feel_first(contacts.a, k, v.u)
+            if contacts.kinds > 1:
+                for k in range(begin, contacts.b.count[0], step):
+                    delta += feel_second(contacts.b, k, v.u)
         delta = block_total(delta)
         if worker % wp.block_dim() == 0:
             delta_out[block] = delta
@@ -215,126 +228,99 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
     @kernel(module)
     def advance(
         first: int,
-        flags: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=scalar),
         now: int,
-        later: int,
-        partial_gamma: wp.array(dtype=scalar),
-        chunks: int,
-        partial_delta: wp.array(dtype=scalar),
-        slots: int,
-        tolerance: scalar,
-        first_norm: wp.array(dtype=scalar),
-        iterations: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        indefinite_out: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
-        chunk_starts: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        arms: wp.array(dtype=vec3),
-        kinds: int,
-        a: First,
-        b: Second,
-        beside: int,
-        w: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        p: wp.array(dtype=vec3),
-        s: wp.array(dtype=vec3),
+        state: State,
+        status: Status,
+        cut: Cut,
+        contacts: Contacts,
+        v: Vectors,
         x: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
-        sums_out: wp.array(dtype=vec6),
     ):
+        """now: which copy of the flags and numbers is read; the other is written."""
         worker = first + wp.tid()
         lane = worker % wp.block_dim()
         chunk = worker // wp.block_dim()
+        later = 1 - now
         tells = worker == 0
-        going = flags[FLAGS * now + GOING]
-        left = flags[FLAGS * now + LEFT]
-        started = flags[FLAGS * now + STARTED]
+        going = state.flags[FLAGS * now + GOING]
+        left = state.flags[FLAGS * now + LEFT]
+        started = state.flags[FLAGS * now + STARTED]
         if going == 0:
             if tells:
-                flags[FLAGS * later + GOING] = 0
+                state.flags[FLAGS * later + GOING] = 0
             return
-        gamma = f.sum_partials(partial_gamma, chunks, lane)
-        delta = f.sum_partials(partial_delta, slots, lane)
+        gamma = f.sum_partials(state.gamma, cut.chunks, lane)
+        delta = f.sum_partials(state.delta, state.slots, lane)
         beta = scalar(0.0)
         curvature = delta
         if started != 0:
             # gamma is what the iteration before has left
-            beta = gamma / numbers[2 * now + GAMMA]
-            curvature = delta - beta * gamma / numbers[2 * now + ALPHA]
+            beta = gamma / state.numbers[2 * now + GAMMA]
+            curvature = delta - beta * gamma / state.numbers[2 * now + ALPHA]
             left -= 1
-            residual = wp.sqrt(gamma) / first_norm[0]
+            residual = wp.sqrt(gamma) / status.first[0]
             if tells:
-                residual_out[0] = residual
-                iterations[0] = iterations[0] + 1
-            if not (residual > tolerance) or left <= 0:
+                status.residual[0] = residual
+                status.iterations[0] = status.iterations[0] + 1
+            if not (residual > status.tolerance) or left <= 0:
                 going = 0
         alpha = gamma / curvature
         if gamma < scalar(0.0):
             # nor with a preconditioner that has one
             going = 0
             if tells:
-                indefinite_out[0] = 1
+                state.indefinite[0] = 1
         bent = int(0)
         if going != 0 and not (curvature > scalar(0.0) or wp.isnan(curvature)):
             # no step along a direction of negative curvature; but it is told
             going = 0
             bent = 1
             if tells:
-                indefinite_out[0] = 1
-                iterations[0] = iterations[0] + 1
+                state.indefinite[0] = 1
+                status.iterations[0] = status.iterations[0] + 1
         if tells:
-            flags[FLAGS * later + GOING] = going
-            flags[FLAGS * later + LEFT] = left
-            flags[FLAGS * later + STARTED] = 1
-            numbers[2 * later + ALPHA] = alpha
-            numbers[2 * later + GAMMA] = gamma
-            going_out[0] = going
+            state.flags[FLAGS * later + GOING] = going
+            state.flags[FLAGS * later + LEFT] = left
+            state.flags[FLAGS * later + STARTED] = 1
+            state.numbers[2 * later + ALPHA] = alpha
+            state.numbers[2 * later + GAMMA] = gamma
+            status.condition[0] = going
         if bent != 0:
-            for m in range(chunk_starts[chunk] + lane, chunk_starts[chunk + 1], wp.block_dim()):
-                i = members[m]
-                p[i] = u[i] + beta * p[i]
+            for m in range(cut.chunk_starts[chunk] + lane, cut.chunk_starts[chunk + 1], wp.block_dim()):
+                i = cut.members[m]
+                v.p[i] = v.u[i] + beta * v.p[i]
         if going == 0:
             return
         total = vec6()
-        for m in range(chunk_starts[chunk] + lane, chunk_starts[chunk + 1], wp.block_dim()):
-            i = members[m]
-            whole = w[i]
-            if beside != 0:
-                w[i] = vec3()
-            if kinds > 0:
-                whole += exert_first(a, i)
-            if kinds > 1:
-                whole += exert_second(b, i)
-            direction = u[i] + beta * p[i]
-            image = whole + beta * s[i]
-            p[i] = direction
-            s[i] = image
+        for m in range(cut.chunk_starts[chunk] + lane, cut.chunk_starts[chunk + 1], wp.block_dim()):
+            i = cut.members[m]
+            whole = v.w[i]
+            if contacts.beside != 0:
+                v.w[i] = vec3()
+            if contacts.kinds > 0:
+                whole += exert_first(contacts.a, i)
+            if contacts.kinds > 1:
+                whole += exert_second(contacts.b, i)
+            direction = v.u[i] + beta * v.p[i]
+            image = whole + beta * v.s[i]
+            v.p[i] = direction
+            v.s[i] = image
             x[i] = x[i] + alpha * direction
-            residual_of = r[i] - alpha * image
-            r[i] = residual_of
-            total += mode(arms[i], residual_of)
+            residual_of = v.r[i] - alpha * image
+            v.r[i] = residual_of
+            total += mode(cut.arms[i], residual_of)
         total = block_sum(total)
         if lane == 0:
-            sums_out[chunk] = total
+            cut.sums[chunk] = total
 
     @kernel(module)
     def correct(
         first: int,
         flags: wp.array(dtype=wp.int32),
         turn: int,
-        groups: int,
-        chunks: int,
-        chunk_starts: wp.array(dtype=wp.int32),
-        chunk_group: wp.array(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        arms: wp.array(dtype=vec3),
-        solved: wp.array(dtype=wide),
-        sums: wp.array(dtype=vec6),
+        cut: Cut,
         inverse: wp.array(dtype=mat33),
-        r: wp.array(dtype=vec3),
-        u_out: wp.array(dtype=vec3),
+        v: Vectors,
         gamma_out: wp.array(dtype=scalar),
     ):
         """turn: which flags say whether to; -1 for always."""
@@ -343,26 +329,28 @@ def kernels(real: Real, first_kind: Operator, second_kind: Operator) -> SimpleNa
         chunk = worker // wp.block_dim()
         if turn >= 0 and flags[FLAGS * wp.max(turn, 0) + GOING] == 0:
             return
-        g = chunk_group[chunk]
-        size = modes * groups
+        g = cut.chunk_group[chunk]
+        size = modes * cut.groups
         z = vec6()
-        for n in range(lane, modes * chunks, wp.block_dim()):
-            part = sums[n // modes][n % modes]
-            column = modes * chunk_group[n // modes] + n % modes
+        for n in range(lane, modes * cut.chunks, wp.block_dim()):
+            part = cut.sums[n // modes][n % modes]
+            column = modes * cut.chunk_group[n // modes] + n % modes
             for i in range(modes):
-                z[i] = z[i] + solved[(modes * g + i) * size + column] * part
+                z[i] = z[i] + cut.solved[(modes * g + i) * size + column] * part
         z = block_sum(z)
         shift = vec3(scalar(z[0]), scalar(z[1]), scalar(z[2]))
         turned = vec3(scalar(z[3]), scalar(z[4]), scalar(z[5]))
         gamma = scalar(0.0)
-        for m in range(chunk_starts[chunk] + lane, chunk_starts[chunk + 1], wp.block_dim()):
-            i = members[m]
-            residual = r[i]
-            corrected = inverse[i] * residual + shift + wp.cross(turned, arms[i])
-            u_out[i] = corrected
+        for m in range(cut.chunk_starts[chunk] + lane, cut.chunk_starts[chunk + 1], wp.block_dim()):
+            i = cut.members[m]
+            residual = v.r[i]
+            corrected = inverse[i] * residual + shift + wp.cross(turned, cut.arms[i])
+            v.u[i] = corrected
             gamma += wp.dot(residual, corrected)
         gamma = block_total(gamma)
         if lane == 0:
             gamma_out[chunk] = gamma
 
-    return SimpleNamespace(begin=begin, multiply=multiply, advance=advance, correct=correct)
+    return SimpleNamespace(
+        begin=begin, multiply=multiply, advance=advance, correct=correct, Contacts=Contacts, Share=Share, State=State
+    )

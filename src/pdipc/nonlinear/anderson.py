@@ -8,10 +8,11 @@ names it as future work (Section 8). The fixed points are the same.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from pdipc.device.language import kernel
+from pdipc.device.language import filled, kernel, struct_of
 from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
@@ -21,63 +22,76 @@ GROWTH = 4.0  # history is dropped when the squared increment grew by more than 
 REGULARIZATION = 1.0e-10  # of the trace, added to the normal equations
 
 
+# sums of one pass: df_new . df_j, then df_j . f, then f . f; and the largest |f|
+sums = wp.types.vector(2 * MEMORY + 2, wp.float64)
+small = wp.types.vector(MEMORY, wp.float64)
+square = wp.types.matrix((MEMORY, MEMORY), wp.float64)
+
+
+@functools.cache
+def history(real: Real) -> Any:
+    """A struct: the last iterations, and how the loop stands. Arrays without a shape have one entry."""
+    return struct_of(
+        "History",
+        __name__,
+        f_last=wp.array(dtype=real.vec3),  # (n,) the last increment, m, and
+        g_last=wp.array(dtype=real.vec3),  # where it led
+        df=wp.array2d(dtype=real.vec3),  # (MEMORY, n) their changes
+        dg=wp.array2d(dtype=real.vec3),
+        gram=wp.array(dtype=square),  # df_i . df_j
+        theta=wp.array(dtype=small),
+        norms=wp.array(dtype=wp.float64),  # (2,) |f|^2 of the last increment; largest |f| of the first
+        moved=wp.array(dtype=real.scalar),  # m, largest |f| of the last
+        fresh=wp.array(dtype=wp.int32),  # whether none was seen in this loop
+        known=wp.array(dtype=wp.int32),  # increments seen since the history was last dropped
+        left=wp.array(dtype=wp.int32),  # iterations
+        done=wp.array(dtype=wp.int32),
+        going=wp.array(dtype=wp.int32),
+    )
+
+
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, History = real.scalar, real.vec3, history(real)
     module = real.module(__name__)
     memory, block = wp.constant(MEMORY), wp.constant(BLOCK)
-    # sums of one pass: df_new . df_j, then df_j . f, then f . f; and the largest |f|
-    sums = wp.types.vector(2 * MEMORY + 2, wp.float64)
-    small = wp.types.vector(MEMORY, wp.float64)
-    square = wp.types.matrix((MEMORY, MEMORY), wp.float64)
 
     @kernel(module)
-    def begin(
-        first: int,
-        iterations: int,
-        fresh_out: wp.array(dtype=wp.int32),
-        known_out: wp.array(dtype=wp.int32),
-        left_out: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
-    ):
-        fresh_out[0] = 1
-        known_out[0] = 0  # increments seen since the history was last dropped
-        left_out[0] = iterations
-        going_out[0] = 1
+    def begin(first: int, iterations: int, o: History):
+        o.fresh[0] = 1
+        o.known[0] = 0
+        o.left[0] = iterations
+        o.going[0] = 1
 
     @kernel(module)
     def push(
         first: int,
         count: int,
-        known: wp.array(dtype=wp.int32),
+        o: History,
         increment: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
         x_tilde: wp.array(dtype=vec3),
-        f_last: wp.array(dtype=vec3),
-        g_last: wp.array(dtype=vec3),
-        df: wp.array2d(dtype=vec3),
-        dg: wp.array2d(dtype=vec3),
         partial_out: wp.array(dtype=sums),
     ):
         b = first + wp.tid()
         total = sums()
-        seen = known[0]
+        seen = o.known[0]
         slot = (seen - 1) % memory
         held = wp.min(seen, memory)
         for i in range(b * block, wp.min((b + 1) * block, count)):
             f = free[i] * increment[i]
             g = x_tilde[i] + f
             if seen > 0:
-                d = f - f_last[i]
-                df[slot, i] = d
-                dg[slot, i] = g - g_last[i]
+                d = f - o.f_last[i]
+                o.df[slot, i] = d
+                o.dg[slot, i] = g - o.g_last[i]
                 for j in range(memory):
                     if j < held:
-                        other = df[j, i]
+                        other = o.df[j, i]
                         total[j] += wp.float64(wp.dot(d, other))
                         total[memory + j] += wp.float64(wp.dot(other, f))
-            f_last[i] = f
-            g_last[i] = g
+            o.f_last[i] = f
+            o.g_last[i] = g
             squared = wp.float64(wp.dot(f, f))
             total[2 * memory] += squared
             # written so that NaN is not lost
@@ -85,7 +99,6 @@ def kernels(real: Real) -> SimpleNamespace:
                 total[2 * memory + 1] = squared
         partial_out[b] = total
 
-    # Long: one thread's bookkeeping and a small system, solved in place.
     @kernel(module)
     def mix(
         first: int,
@@ -93,17 +106,9 @@ def kernels(real: Real) -> SimpleNamespace:
         blocks: int,
         tolerance: scalar,
         relative_tolerance: scalar,
-        gram: wp.array(dtype=square),
-        theta_out: wp.array(dtype=small),
-        norms: wp.array(dtype=wp.float64),
-        moved_out: wp.array(dtype=scalar),
-        fresh: wp.array(dtype=wp.int32),
-        known: wp.array(dtype=wp.int32),
-        left: wp.array(dtype=wp.int32),
-        done: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
+        o: History,
     ):
-        """Solves for theta and decides whether to go on. norms: |f|^2 of the last increment; largest |f| of the first."""
+        """Solves for theta and decides whether to go on."""
         total = sums()
         largest = wp.float64(0.0)
         for b in range(blocks):
@@ -113,24 +118,24 @@ def kernels(real: Real) -> SimpleNamespace:
                 largest = p[2 * memory + 1]
         squared = total[2 * memory]
         moved = wp.sqrt(largest)
-        seen = known[0]
-        if fresh[0] == 1:
-            fresh[0] = 0
-            norms[1] = moved
-        done[0] = done[0] + 1
-        left[0] = left[0] - 1
-        moved_out[0] = scalar(moved)
+        seen = o.known[0]
+        if o.fresh[0] == 1:
+            o.fresh[0] = 0
+            o.norms[1] = moved
+        o.done[0] = o.done[0] + 1
+        o.left[0] = o.left[0] - 1
+        o.moved[0] = scalar(moved)
         theta = small()
-        stop = left[0] <= 0 or not (moved > wp.float64(tolerance)) or moved <= wp.float64(relative_tolerance) * norms[1]
+        stop = o.left[0] <= 0 or not (moved > wp.float64(tolerance)) or moved <= wp.float64(relative_tolerance) * o.norms[1]
         if seen > 0:
-            a = gram[0]
+            a = o.gram[0]
             slot = (seen - 1) % memory
             held = wp.min(seen, memory)
             for j in range(memory):
                 a[slot, j] = total[j]
                 a[j, slot] = total[j]
-            gram[0] = a
-            if squared > wp.float64(GROWTH) * norms[0]:
+            o.gram[0] = a
+            if squared > wp.float64(GROWTH) * o.norms[0]:
                 seen = 0
             elif not stop:
                 # Cholesky of the normal equations; a direction that adds nothing new gets no part
@@ -165,30 +170,23 @@ def kernels(real: Real) -> SimpleNamespace:
                             if k < held:
                                 s -= low[k, i] * theta[k]
                         theta[i] = s / low[i, i]
-        norms[0] = squared
-        known[0] = seen + 1
-        theta_out[0] = theta
+        o.norms[0] = squared
+        o.known[0] = seen + 1
+        o.theta[0] = theta
         if stop:
-            going_out[0] = 0
+            o.going[0] = 0
 
     @kernel(module)
-    def combine(
-        first: int,
-        known: wp.array(dtype=wp.int32),
-        theta: wp.array(dtype=small),
-        g: wp.array(dtype=vec3),
-        dg: wp.array2d(dtype=vec3),
-        x_tilde_out: wp.array(dtype=vec3),
-    ):
+    def combine(first: int, o: History, x_tilde_out: wp.array(dtype=vec3)):
         i = first + wp.tid()
-        x = g[i]
-        held = wp.min(known[0] - 1, memory)
-        weights = theta[0]
+        x = o.g_last[i]
+        held = wp.min(o.known[0] - 1, memory)
+        weights = o.theta[0]
         for j in range(held):
-            x -= scalar(weights[j]) * dg[j, i]
+            x -= scalar(weights[j]) * o.dg[j, i]
         x_tilde_out[i] = x
 
-    return SimpleNamespace(begin=begin, push=push, mix=mix, combine=combine, sums=sums, small=small, square=square)
+    return SimpleNamespace(begin=begin, push=push, mix=mix, combine=combine)
 
 
 class Anderson:
@@ -211,24 +209,20 @@ class Anderson:
 
         self.f_last, self.g_last = zeros(real.vec3, count), zeros(real.vec3, count)
         self.df, self.dg = zeros(real.vec3, (MEMORY, count)), zeros(real.vec3, (MEMORY, count))
-        self.partial = zeros(self.kernels.sums, self.blocks)
-        self.gram, self.theta = zeros(self.kernels.square), zeros(self.kernels.small)
+        self.partial = zeros(sums, self.blocks)
+        self.gram, self.theta = zeros(square), zeros(small)
         self.norms, self.moved = zeros(wp.float64, 2), zeros(real.scalar)
         self.fresh, self.known, self.left, self.done, self.going = (zeros(wp.int32) for _ in range(5))
+        self.history = filled(history(real), self)
 
     def begin(self, iterations: int) -> None:
         """Launches the start of a loop of at most so many iterations, without history."""
-        self.device.launch_serial(self.kernels.begin, [iterations, self.fresh, self.known, self.left, self.going])
+        self.device.launch_serial(self.kernels.begin, [iterations, self.history])
 
     def advance(self, x_tilde: wp.array, increment: wp.array, free: wp.array) -> None:
         """Launches the update of x~ by the global step's increment, accelerated, and the decision whether to go on."""
         k, device = self.kernels, self.device
-        history = [self.f_last, self.g_last, self.df, self.dg]
-        device.launch(
-            k.push, self.blocks, [self.count, self.known, increment, free, x_tilde, *history, self.partial], grain=BLOCK
-        )
-        counters = [self.fresh, self.known, self.left, self.done, self.going]
-        device.launch_serial(
-            k.mix, [self.partial, self.blocks, *self.limits, self.gram, self.theta, self.norms, self.moved, *counters]
-        )
-        device.launch(k.combine, self.count, [self.known, self.theta, self.g_last, self.dg, x_tilde])
+        inputs = [self.count, self.history, increment, free, x_tilde, self.partial]
+        device.launch(k.push, self.blocks, inputs, grain=BLOCK)
+        device.launch_serial(k.mix, [self.partial, self.blocks, *self.limits, self.history])
+        device.launch(k.combine, self.count, [self.history, x_tilde])

@@ -19,14 +19,17 @@ import warp as wp
 
 from pdipc.barrier.exact import BarrierTerm
 from pdipc.barrier.friction import FrictionTerm
-from pdipc.collision.islands import Islands
+from pdipc.barrier.pairs import frozen
+from pdipc.collision.islands import Groups, Islands
+from pdipc.collision.truncation import truncated
 from pdipc.device import blocks
-from pdipc.device.language import func, kernel
+from pdipc.device.language import filled, func, kernel, struct, struct_of
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
+from pdipc.integration import inertia as implicit
 from pdipc.integration import status
-from pdipc.integration.script import AHEAD, ARRIVED, WILL
+from pdipc.integration.script import AHEAD, ARRIVED, WILL, led
 
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
@@ -87,6 +90,74 @@ def curved(arm: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
     return result
 
 
+@struct
+class Energies:
+    """The potential of each body, J: at x and where it is tried, without friction and that alone; and of its island."""
+
+    base_old: wp.array[wp.float64]
+    friction_old: wp.array[wp.float64]
+    base_new: wp.array[wp.float64]
+    friction_new: wp.array[wp.float64]
+    before: wp.array[wp.float64]  # scratch
+    after: wp.array[wp.float64]
+
+
+@struct
+class Search:
+    """How the line search of an outer iteration stands. Arrays of one entry but those of bodies."""
+
+    hits: wp.array[wp.int32]  # passes of truncation that found hits
+    attempts: wp.array[wp.int32]  # lengths that were tried
+    searching: wp.array[wp.int32]  # whether another one is to be tried
+    lowered: wp.array[wp.int32]  # whether the potential of any island has fallen by more than rounding
+    accepted: wp.array[wp.int32]  # of bodies, whether their island is done
+    squeezed: wp.array[wp.int32]  # of bodies, by their island's first: whether a pair that was squeezed before was hit
+    project: wp.array[wp.int32]  # whether Hessians are made positive semidefinite
+    restrained: wp.array[wp.int32]  # whether any body is held back
+
+
+@functools.cache
+def limits(real: Real) -> Any:
+    """A struct: where a step ends."""
+    return struct_of(
+        "Limits",
+        __name__,
+        tolerance=real.scalar,  # m
+        most_change=real.scalar,  # of a barrier's curvature, in parts of it
+        max_outer=int,
+        most_idle=int,  # outer iterations in a row in which no potential falls by more than rounding
+        budget_ms=wp.float64,
+    )
+
+
+@functools.cache
+def bodies(real: Real) -> Any:
+    """A struct: bodies as ranges of vertices."""
+    return struct_of(
+        "Bodies",
+        __name__,
+        starts=wp.array(dtype=wp.int32),
+        ends=wp.array(dtype=wp.int32),
+        whole=wp.array(dtype=wp.int32),  # whether none of its vertices is held
+        mass=wp.array(dtype=real.scalar),  # of each vertex, kg
+    )
+
+
+@functools.cache
+def motion(real: Real) -> Any:
+    """A struct: the step that an outer iteration wants to make, u -> u_tilde, with the rotation of each body in it."""
+    return struct_of(
+        "Motion",
+        __name__,
+        base=wp.array(dtype=real.vec3),
+        u=wp.array(dtype=real.vec3),
+        u_tilde=wp.array(dtype=real.vec3),
+        free=wp.array(dtype=real.scalar),
+        center=wp.array(dtype=wp.vec3d),  # of each body, m
+        turn=wp.array(dtype=wp.vec3d),  # rad
+    )
+
+
 @func
 def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d:
     """The rotation, rad, whose angular momentum is that given, m L: of masses whose m |arm|^2 and m arm arm^T sum to square and outer."""
@@ -96,7 +167,10 @@ def turned(square: wp.float64, outer: wp.mat33d, momentum: wp.vec3d) -> wp.vec3d
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
+    scalar, vec3, Frozen, Truncated, Led = real.scalar, real.vec3, frozen(real), truncated(real), led(real)
+    Inertial, Progress, Bodies, Limits, Motion = (
+        each(real) for each in (implicit.inertial, status.progress, bodies, limits, motion)
+    )
     module = real.module(__name__)
     wide = wp.float64
     slack = wp.constant(wp.float64(SLACK[real.name]))
@@ -107,87 +181,71 @@ def kernels(real: Real) -> SimpleNamespace:
     def inertia(
         first: int,
         u: wp.array(dtype=vec3),
-        rest: wp.array(dtype=vec3),
-        z: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar),
-        free: wp.array(dtype=scalar),
-        h: scalar,
-        damping: scalar,
+        o: Inertial,
         beside: wp.array(dtype=wide),
         force_out: wp.array(dtype=vec3),
         energy_out: wp.array(dtype=wide),
     ):
         """-dE/du of each vertex (line 8), with mass-proportional damping, and E with what is beside it."""
         i = first + wp.tid()
-        scale = free[i] * mass[i] / h
-        force_out[i] = scale / h * (z[i] - u[i]) - scale * damping * (u[i] - rest[i])
-        energy = wide(scale) / wide(h) * squared(u[i], z[i]) + wide(scale) * wide(damping) * squared(u[i], rest[i])
+        scale = o.free[i] * o.mass[i] / o.h
+        force_out[i] = scale / o.h * (o.z[i] - u[i]) - scale * o.damping * (u[i] - o.rest[i])
+        energy = wide(scale) / wide(o.h) * squared(u[i], o.z[i]) + wide(scale) * wide(o.damping) * squared(u[i], o.rest[i])
         energy_out[i] = wide(0.5) * energy + beside[i]
 
     @kernel(module)
     def judge(
         first: int,
-        bodies: int,
-        label: wp.array(dtype=wp.int32),
-        driven: wp.array(dtype=wp.int32),
+        islands: Groups,
         deep: wp.array(dtype=wp.int32),
-        base_old: wp.array(dtype=wide),
-        friction_old: wp.array(dtype=wide),
-        base_new: wp.array(dtype=wide),
-        friction_new: wp.array(dtype=wide),
+        e: Energies,
         overflow: wp.array(dtype=wp.int32),
         negligible: wide,
-        before: wp.array(dtype=wide),
-        after: wp.array(dtype=wide),
-        squeezed: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
-        accepted_out: wp.array(dtype=wp.int32),
-        lowered_out: wp.array(dtype=wp.int32),
-        searching_out: wp.array(dtype=wp.int32),
+        search: Search,
     ):
-        """Whether the potential of each island has not risen; lowered: whether that of any has fallen by more than rounding. before, after,
-        squeezed: (bodies,) scratch. What was squeezed before is not squeezed again while the rest goes on: such an island goes back as a whole."""
-        for b in range(bodies):
-            before[b] = wide(0.0)
-            after[b] = wide(0.0)
-            accepted_out[b] = 0
-            squeezed[b] = 0
-        for b in range(bodies):
+        """Whether the potential of each island has not risen. What was squeezed before is not squeezed again while the rest goes on: such an
+        island goes back as a whole.
+        """
+        for b in range(islands.count):
+            e.before[b] = wide(0.0)
+            e.after[b] = wide(0.0)
+            search.accepted[b] = 0
+            search.squeezed[b] = 0
+        for b in range(islands.count):
+            island = islands.label[b]
             if deep[b] != 0:
-                squeezed[label[b]] = 1
-            before[label[b]] = before[label[b]] + base_old[b] + friction_old[b]
-            after[label[b]] = after[label[b]] + base_new[b] + friction_new[b]
-            if driven[b] != 0:
-                accepted_out[label[b]] = 1
+                search.squeezed[island] = 1
+            e.before[island] = e.before[island] + e.base_old[b] + e.friction_old[b]
+            e.after[island] = e.after[island] + e.base_new[b] + e.friction_new[b]
+            if islands.driven[b] != 0:
+                search.accepted[island] = 1
         searching = int(0)
-        lowered_out[0] = 0
-        for b in range(bodies):
-            island = label[b]
-            ok = accepted_out[island]
-            unseen = slack * wp.abs(before[island]) + negligible
-            if after[island] <= before[island] + unseen or attempts[0] > HALVINGS:
+        search.lowered[0] = 0
+        for b in range(islands.count):
+            island = islands.label[b]
+            ok = search.accepted[island]
+            unseen = slack * wp.abs(e.before[island]) + negligible
+            if e.after[island] <= e.before[island] + unseen or search.attempts[0] > HALVINGS:
                 ok = 1
-            if after[island] < before[island] - unseen:
-                lowered_out[0] = 1
-            if squeezed[island] != 0 and attempts[0] == 0:
+            if e.after[island] < e.before[island] - unseen:
+                search.lowered[0] = 1
+            if search.squeezed[island] != 0 and search.attempts[0] == 0:
                 ok = 0
-            accepted_out[b] = ok
+            search.accepted[b] = ok
             if ok == 0:
                 searching = 1
-        attempts[0] = attempts[0] + 1
+        search.attempts[0] = search.attempts[0] + 1
         if overflow[0] != 0:
             searching = 0
-        searching_out[0] = searching
+        search.searching[0] = searching
 
     @kernel(module)
     def least_fraction(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
+        bodies: Bodies,
         free: wp.array(dtype=scalar),
         attempts: wp.array(dtype=wp.int32),
-        first_fraction: wp.array(dtype=scalar),
-        fraction: wp.array(dtype=scalar),
+        t: Truncated,
         least_out: wp.array(dtype=scalar),
     ):
         """What the first pass of truncation left to every vertex of a body, or later what it makes now: CCD may have cut some anew, and only
@@ -196,11 +254,11 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         least = scalar(1.0)
-        for i in range(starts[b] + worker % wp.block_dim(), ends[b], wp.block_dim()):
+        for i in range(bodies.starts[b] + worker % wp.block_dim(), bodies.ends[b], wp.block_dim()):
             if free[i] > scalar(0.0):
-                part = fraction[i]
+                part = t.fraction[i]
                 if attempts[0] == 1:
-                    part = first_fraction[i]
+                    part = t.first_fraction[i]
                 least = wp.min(least, part)
         least = least_number(least)
         if worker % wp.block_dim() == 0:
@@ -222,44 +280,35 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def turn_back(
         first: int,
-        body: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
-        accepted: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
+        islands: Groups,
+        search: Search,
         least: wp.array(dtype=scalar),
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        u_tilde: wp.array(dtype=vec3),
-        center: wp.array(dtype=wp.vec3d),
-        turn: wp.array(dtype=wp.vec3d),
-        fraction: wp.array(dtype=scalar),
-        u_end_out: wp.array(dtype=vec3),
-        x_end_out: wp.array(dtype=vec3),
-        passes_out: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
+        o: Motion,
+        t: Truncated,
     ):
         """A part of the step, and of the rotation of the body: where on the arc, not on its chord."""
         i = first + wp.tid()
         if i == 0:
-            passes_out[0] = 1  # what is not shortened has been proven already
-            going_out[0] = 1
-        b = body[i]
-        if b >= 0 and accepted[wp.max(b, 0)] == 0:
-            f = least[label[b]]
-            if attempts[0] > 1 or f >= scalar(1.0):
+            t.passes[0] = 1  # what is not shortened has been proven already
+            t.going[0] = 1
+        b = islands.body[i]
+        if b >= 0 and search.accepted[wp.max(b, 0)] == 0:
+            f = least[islands.label[b]]
+            if search.attempts[0] > 1 or f >= scalar(1.0):
                 f = scalar(0.5) * f
-            if attempts[0] >= HALVINGS:
+            if search.attempts[0] >= HALVINGS:
                 f = scalar(0.0)
-            fraction[i] = f
-            arm = widened(base[i] + u[i]) - center[b]
-            arc = vec3(curved(arm, wide(f) * turn[b])) - f * vec3(curved(arm, turn[b]))
-            u_end_out[i] = u[i] + f * (u_tilde[i] - u[i]) + arc
-            x_end_out[i] = base[i] + u_end_out[i]
+            t.fraction[i] = f
+            arm = widened(o.base[i] + o.u[i]) - o.center[b]
+            arc = vec3(curved(arm, wide(f) * o.turn[b])) - f * vec3(curved(arm, o.turn[b]))
+            if o.free[i] == scalar(0.0):
+                arc = vec3()
+            t.u_end[i] = o.u[i] + f * (o.u_tilde[i] - o.u[i]) + arc
+            t.x_end[i] = o.base[i] + t.u_end[i]
 
     @kernel(module)
     def commit(
         first: int,
-        count: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         base: wp.array(dtype=vec3),
         goal: wp.array(dtype=vec3),
@@ -291,19 +340,9 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def crowd(
         first: int,
-        pairs: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.vec4i),
-        free: wp.array(dtype=scalar),
-        gaps: wp.array(dtype=scalar),
-        activation: wp.array(dtype=scalar),
-        weights: wp.array(dtype=vec4),
-        normals: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        base: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        mover: wp.array(dtype=wp.int32),
-        body: wp.array(dtype=wp.int32),
-        label: wp.array(dtype=wp.int32),
+        pairs: Frozen,
+        o: Led,
+        islands: Groups,
         squeezed: wp.array(dtype=wp.int32),
         restraint: wp.array(dtype=scalar),
         crowded_out: wp.array(dtype=wp.int32),
@@ -313,30 +352,27 @@ def kernels(real: Real) -> SimpleNamespace:
         """
         k = first + wp.tid()
         waits = False
-        if k < pairs[0]:
-            waits = gaps[k] < scalar(SQUEEZED) * activation[k]
+        if k < pairs.count[0]:
+            waits = pairs.gaps[k] < scalar(SQUEEZED) * pairs.activation[k]
             for s in range(4):
-                b = body[quads[k][s]]
+                b = islands.body[pairs.quads[k][s]]
                 if b >= 0:
-                    waits = waits or restraint[b] > scalar(0.0) or squeezed[label[b]] != 0
+                    waits = waits or restraint[b] > scalar(0.0) or squeezed[islands.label[b]] != 0
         if waits:
             closing = scalar(0.0)
             for s in range(4):
-                i = quads[k][s]
-                if free[i] == scalar(0.0):
-                    closing += weights[k][s] * wp.dot(normals[k], (target[i] - base[i]) - u[i])
+                i = pairs.quads[k][s]
+                if o.free[i] == scalar(0.0):
+                    closing += pairs.weights[k][s] * wp.dot(pairs.normals[k], (o.target[i] - o.base[i]) - o.u[i])
             for s in range(4):
-                i = quads[k][s]
-                if free[i] == scalar(0.0) and closing < scalar(0.0):
-                    crowded_out[mover[i]] = 1
+                i = pairs.quads[k][s]
+                if o.free[i] == scalar(0.0) and closing < scalar(0.0):
+                    crowded_out[o.mover[i]] = 1
 
     @kernel(module)
     def weigh(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        whole: wp.array(dtype=wp.int32),
-        mass: wp.array(dtype=scalar),
+        bodies: Bodies,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         inertial: wp.array(dtype=vec3),
@@ -348,16 +384,16 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        start = starts[b]
-        end = ends[b]
-        if whole[b] == 0:
+        start = bodies.starts[b]
+        end = bodies.ends[b]
+        if bodies.whole[b] == 0:
             end = start
         origin = base[start]
         total = wide(0.0)
         center = wp.vec3d()
         force = wp.vec3d()
         for i in range(start + lane, end, wp.block_dim()):
-            m = wide(mass[i])
+            m = wide(bodies.mass[i])
             total += m
             center += m * widened((base[i] - origin) + u[i])
             force += widened(inertial[i] + barrier[i])
@@ -370,7 +406,7 @@ def kernels(real: Real) -> SimpleNamespace:
         outer = wp.mat33d()
         torque = wp.vec3d()
         for i in range(start + lane, end, wp.block_dim()):
-            m = wide(mass[i])
+            m = wide(bodies.mass[i])
             arm = widened((base[i] - origin) + u[i]) - center
             square += m * wp.length_sq(arm)
             outer += m * wp.outer(arm, arm)
@@ -423,88 +459,86 @@ def kernels(real: Real) -> SimpleNamespace:
     def decide(
         first: int,
         pairs: wp.array(dtype=wp.int32),
-        hits: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
         script: wp.array(dtype=wp.int32),
-        projected: wp.array(dtype=wp.int32),
-        restrained: wp.array(dtype=wp.int32),
-        lowered: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
-        clock: wp.array(dtype=wide),
-        tolerance: scalar,
-        most_change: scalar,
-        max_outer: int,
-        most_idle: int,
-        budget_ms: wide,
-        numbers: wp.array(dtype=scalar),
-        count: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
+        search: Search,
+        limits: Limits,
+        progress: Progress,
     ):
-        """Line 16. script: its flags. numbers: the largest wanted motion and lag, m.
+        """Line 16. pairs: how many act. script: its flags.
 
         Whatever is limited begins anew where something scripted came to a waypoint: what follows is another problem.
         """
         code = int(status.RUNNING)
-        residual = numbers[status.MOVED]
-        behind = numbers[status.LAG] > scalar(0.0)
+        residual = progress.numbers[status.MOVED]
+        behind = progress.numbers[status.LAG] > scalar(0.0)
         # of a sequence that shrinks by the ratio r, r / (1 - r) times the last motion is left; near the end Newton's ratio vanishes.
         # One motion alone says nothing: the first step out of a stiff barrier is short, however far the way is that it opens
         ratio = scalar(0.99)
-        if count[status.OUTER] > 0:
-            ratio = wp.min(residual / wp.max(numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
-        left = wp.max(residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio)), numbers[status.UNBALANCED])
-        numbers[status.MOVED_BEFORE] = residual
+        if progress.count[status.OUTER] > 0:
+            ratio = wp.min(residual / wp.max(progress.numbers[status.MOVED_BEFORE], scalar(1.0e-30)), scalar(0.99))
+        left = wp.max(residual * wp.max(scalar(1.0), ratio / (scalar(1.0) - ratio)), progress.numbers[status.UNBALANCED])
+        progress.numbers[status.MOVED_BEFORE] = residual
         if overflow[0] != 0:
             code = status.OVERFLOW
         else:
-            count[status.OUTER] = count[status.OUTER] + 1
-            count[status.SINCE] = count[status.SINCE] + 1
-            count[status.BARRIERS] = pairs[0]
+            progress.count[status.OUTER] = progress.count[status.OUTER] + 1
+            progress.count[status.SINCE] = progress.count[status.SINCE] + 1
+            progress.count[status.BARRIERS] = pairs[0]
             if script[ARRIVED] != 0:
-                count[status.SINCE] = 0
-                count[status.STALLED] = 0
-            if hits[0] > 0:
-                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
-            if attempts[0] > 1:
-                count[status.SEARCHES] = count[status.SEARCHES] + 1
-            if attempts[0] > HALVINGS:
-                count[status.STALLED] = count[status.STALLED] + 1
-            count[status.IDLE] = count[status.IDLE] + 1
-            if lowered[0] != 0 or count[status.MOVING] != 0 or script[ARRIVED] != 0:
-                count[status.IDLE] = 0
-            most_rounded = scalar(ROUNDED) * tolerance
-            if projected[0] != 0:
+                progress.count[status.SINCE] = 0
+                progress.count[status.STALLED] = 0
+            if search.hits[0] > 0:
+                progress.count[status.TRUNCATIONS] = progress.count[status.TRUNCATIONS] + 1
+            if search.attempts[0] > 1:
+                progress.count[status.SEARCHES] = progress.count[status.SEARCHES] + 1
+            if search.attempts[0] > HALVINGS:
+                progress.count[status.STALLED] = progress.count[status.STALLED] + 1
+            progress.count[status.IDLE] = progress.count[status.IDLE] + 1
+            if search.lowered[0] != 0 or progress.count[status.MOVING] != 0 or script[ARRIVED] != 0:
+                progress.count[status.IDLE] = 0
+            most_rounded = scalar(ROUNDED) * limits.tolerance
+            if search.project[0] != 0:
                 left = left / scalar(EXACT)
                 most_rounded = scalar(EXACT) * most_rounded
             # a step that is short beside the tolerance, and that the potential does not show, is what rounding leaves of the forces
-            done = left <= tolerance and attempts[0] == 1 and numbers[status.BARRIER_CHANGE] <= most_change
-            if attempts[0] > 1 and lowered[0] == 0 and residual <= scalar(EXACT) * tolerance:
+            done = (
+                left <= limits.tolerance
+                and search.attempts[0] == 1
+                and progress.numbers[status.BARRIER_CHANGE] <= limits.most_change
+            )
+            if search.attempts[0] > 1 and search.lowered[0] == 0 and residual <= scalar(EXACT) * limits.tolerance:
                 done = True
             # and where nothing falls for long, motions are rounding's: their ratios say nothing
-            if count[status.IDLE] >= most_idle and wp.max(residual, numbers[status.UNBALANCED]) <= most_rounded:
+            if (
+                progress.count[status.IDLE] >= limits.most_idle
+                and wp.max(residual, progress.numbers[status.UNBALANCED]) <= most_rounded
+            ):
                 done = True
-            settled = done and hits[0] == 0 and count[status.MOVING] == 0 and restrained[0] == 0
+            settled = done and search.hits[0] == 0 and progress.count[status.MOVING] == 0 and search.restrained[0] == 0
             if residual >= scalar(wp.inf):
                 code = status.NOT_FINITE
             elif settled and not behind and script[AHEAD] == 0:
                 code = status.CONVERGED
             elif settled and script[WILL] == 0:
                 code = status.LAGGING
-            elif count[status.STALLED] >= STALLS or count[status.IDLE] >= most_idle:
+            elif progress.count[status.STALLED] >= STALLS or progress.count[status.IDLE] >= limits.most_idle:
                 code = status.STALLING
-            elif budget_ms > wide(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+            elif (
+                limits.budget_ms > wide(0.0) and progress.clock[status.LAST] - progress.clock[status.STARTED] > limits.budget_ms
+            ):
                 code = status.OUT_OF_TIME
-            elif count[status.SINCE] >= max_outer:
+            elif progress.count[status.SINCE] >= limits.max_outer:
                 code = status.CAPPED
         # what is held back wants less than it would: a step that ends so tells of the last motion that was wanted freely
-        if restrained[0] == 0:
-            numbers[status.MOVED_FREELY] = residual
+        if search.restrained[0] == 0:
+            progress.numbers[status.MOVED_FREELY] = residual
         elif code != status.RUNNING:
-            numbers[status.MOVED] = wp.max(residual, numbers[status.MOVED_FREELY])
-        count[status.STATUS] = code
-        going_out[0] = 0
+            progress.numbers[status.MOVED] = wp.max(residual, progress.numbers[status.MOVED_FREELY])
+        progress.count[status.STATUS] = code
+        progress.going[0] = 0
         if code == status.RUNNING:
-            going_out[0] = 1
+            progress.going[0] = 1
 
     @kernel(module)
     def note_motion(
@@ -521,14 +555,10 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def restrain(
         first: int,
-        bodies: int,
-        label: wp.array(dtype=wp.int32),
-        driven: wp.array(dtype=wp.int32),
-        squeezed: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
+        islands: Groups,
+        search: Search,
         least: wp.array(dtype=scalar),
         restraint: wp.array(dtype=scalar),
-        restrained_out: wp.array(dtype=wp.int32),
     ):
         """By how many times its inertia each body is held back, as in the method of Levenberg and Marquardt.
 
@@ -536,20 +566,42 @@ def kernels(real: Real) -> SimpleNamespace:
         that makes no way, and squeezes the gap further. Inertia shortens the sliding and leaves the opening, which is stiff, as it is.
         """
         restrained = int(0)
-        for b in range(bodies):
-            island = label[b]
+        for b in range(islands.count):
+            island = islands.label[b]
             r = scalar(RELEASE) * restraint[b]
             if r < scalar(RELEASED):
                 r = scalar(0.0)
-            if squeezed[island] != 0 and attempts[0] > 1 and least[island] < scalar(RESTRAIN) and driven[b] == 0:
+            if (
+                search.squeezed[island] != 0
+                and search.attempts[0] > 1
+                and least[island] < scalar(RESTRAIN)
+                and islands.driven[b] == 0
+            ):
                 r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
                 r = wp.min(r, scalar(MOST_RESTRAINT))
             restraint[b] = r
             if r > scalar(0.0):
                 restrained = 1
-        restrained_out[0] = restrained
+        search.restrained[0] = restrained
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        inertia=inertia,
+        judge=judge,
+        least_fraction=least_fraction,
+        spread_least=spread_least,
+        turn_back=turn_back,
+        commit=commit,
+        commit_energies=commit_energies,
+        crowd=crowd,
+        weigh=weigh,
+        clear=clear,
+        exempt=exempt,
+        start=start,
+        before_search=before_search,
+        decide=decide,
+        note_motion=note_motion,
+        restrain=restrain,
+    )
 
 
 def islands_of(model, owner: np.ndarray) -> Islands:
@@ -578,7 +630,6 @@ class Descent:
     force that would move a body as a whole: for methods whose motions say little of how much is left, such as local-global iterations of stiff bodies.
     """
 
-    # Long: all that lives as long as the solve is made here.
     def __init__(self, work, frictional: bool = True, descends: bool = True, weighs: bool = False):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count
@@ -618,18 +669,35 @@ class Descent:
         flags = (zeros(wp.int32, 1) for _ in range(6))
         self.attempts, self.searching, self.hits, self.project, self.restrained, self.lowered = flags
         self.restraint = zeros(scalar, self.bodies)
+        self.energies, self.search = filled(Energies, self), filled(Search, self)
+        self.limits = limits(real)()
+        self.limits.tolerance, self.limits.max_outer = settings.tolerance, settings.max_outer
+        self.limits.most_change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
+        # what need not lower the potential does not idle where it does not
+        self.limits.most_idle = IDLE if descends else settings.max_outer
+        self.limits.budget_ms = settings.budget_ms or 0.0
+        self.motion = motion(real)()
+        self.motion.base, self.motion.u, self.motion.u_tilde = work.x_start, work.u, work.u_tilde
+        self.motion.free, self.motion.center, self.motion.turn = model.free, self.center, self.turn
         self.pairs.project = self.project
         self._make_room()
         tied = {int(owner[v]) for s in model.projector.sets if s.kind in TIES for v in s.vertices.ravel()}
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
         self.weighs = weighs and any(whole)
+        self.balanced = self._bodies(whole)
         if self.weighs:
-            self.balanced = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
             self.unbalanced = zeros(scalar, self.bodies)
             self.largest_of_bodies = Largest(device, real, [self.bodies])
         mass = model.mass.numpy()
         lightest = float(mass[free & (mass > 0.0)].min()) if free.any() else 1.0
         self.tolerated = PCG_PART * settings.tolerance * np.sqrt(lightest) / settings.time_step
+
+    def _bodies(self, whole: list[bool]) -> Any:
+        """The bodies as kernels take them, of which these count as whole."""
+        made = bodies(self.model.real)()
+        made.starts, made.ends, made.mass = self.starts, self.ends, self.model.mass
+        made.whole = wp.array(np.array([*whole, False], dtype=np.int32), device=self.device.warp)
+        return made
 
     @property
     def generation(self) -> int:
@@ -667,18 +735,16 @@ class Descent:
         """Which movers wait, as things are since the potential was evaluated."""
         w, p = self.work, self.pairs
         self.device.launch(self.descending.clear, len(w.script.movers), [w.script.crowded])
-        inputs = [p.count, p.quads, self.model.free, p.gaps, p.activation, p.weights, p.normals]
-        inputs += [w.u, w.x_start, w.script.target, w.script.mover, self.islands.body, self.islands.label]
-        self.device.launch(self.descending.crowd, p.capacity, [*inputs, self.squeezed, self.restraint, w.script.crowded])
+        inputs = [p.frozen, w.led(), self.islands.groups, self.squeezed, self.restraint, w.script.crowded]
+        self.device.launch(self.descending.crowd, p.capacity, inputs)
 
     def _evaluate(self, u: wp.array, x: wp.array) -> None:
         """The potential and the forces at x; with friction as it lags."""
         w, k, device, n = self.work, self.descending, self.device, self.model.vertex_count
-        s, real = self.model.settings, self.model.real
         self.pairs.freeze(w.candidates, x)
         self.pairs.differentiate(x)
-        inputs = [u, w.rest, w.z, self.model.mass, self.model.free, real.scalar(s.time_step), real.scalar(s.damping)]
-        device.launch(k.inertia, n, [*inputs, self.pairs.energy_of_vertex, self.inertial, self.vertex_energy])
+        inputs = [u, w.inertial(), self.pairs.energy_of_vertex, self.inertial, self.vertex_energy]
+        device.launch(k.inertia, n, inputs)
         self.model.projector.evaluate(w.x_start, u)
         self._sum_energies()
         if self.friction is not None:
@@ -700,42 +766,26 @@ class Descent:
 
     def accept(self) -> None:
         """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
-        w, k, device, n, model, t = (
-            self.work,
-            self.descending,
-            self.device,
-            self.model.vertex_count,
-            self.model,
-            self.work.truncation,
-        )
+        w, t, model = self.work, self.work.truncation, self.model
+        k, device, n, islands = self.descending, self.device, model.vertex_count, self.islands
         device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts, w.count])
-        self.islands.renew(w.candidates)
+        islands.renew(w.candidates)
         if w.script.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
-            self.islands.find_driven(w.candidates, w.u, w.u_tilde)
+            islands.find_driven(w.candidates, w.u, w.u_tilde)
         if not self.descends and self.bodies:
-            device.launch(k.exempt, self.bodies, [self.islands.driven])
+            device.launch(k.exempt, self.bodies, [islands.driven])
         self._evaluate(t.u_end, t.x_end)
-        energies = [
-            self.base_old,
-            self.friction_old,
-            self.base_new,
-            self.friction_new,
-            w.candidates.overflow,
-            self.tolerated**2,
-        ]
-        judged = [self.before, self.after, self.squeezed, self.attempts, self.accepted, self.lowered, self.searching]
-        judging = [self.bodies, self.islands.label, self.islands.driven, t.deep, *energies, *judged]
+        judging = [islands.groups, t.deep, self.energies, w.candidates.overflow, self.tolerated**2, self.search]
         device.launch_serial(k.judge, judging)
 
         def search() -> None:
             if self.bodies:
-                inputs = [self.starts, self.ends, model.free, self.attempts, t.first_fraction, t.fraction, self.least]
+                inputs = [self.balanced, model.free, self.attempts, t.truncated, self.least]
                 device.launch_blocks(k.least_fraction, self.bodies, inputs, grain=1000)
-                device.launch_serial(k.spread_least, [self.bodies, self.islands.label, self.least, self.island_least])
-            which = [self.islands.body, self.islands.label, self.accepted, self.attempts, self.island_least]
-            motion = [w.x_start, w.u, w.u_tilde, self.center, self.turn, t.fraction, t.u_end, t.x_end, t.passes, t.going]
-            device.launch(k.turn_back, n, [*which, *motion])
+                device.launch_serial(k.spread_least, [self.bodies, islands.label, self.least, self.island_least])
+            inputs = [islands.groups, self.search, self.island_least, self.motion, t.truncated]
+            device.launch(k.turn_back, n, inputs)
             w.candidates.check(w.x, t.x_end)
             device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, t.x_end))
             t.prove(w.candidates, w.x_start, w.u, w.u_tilde, w.x)
@@ -743,42 +793,18 @@ class Descent:
             device.launch_serial(k.judge, judging)
 
         device.loop(self.searching, search)
-        inputs = [w.count, w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
+        inputs = [w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
         device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
         self.largest.find([self.lags, self.pairs.change], self.numbers, [status.LAG, status.BARRIER_CHANGE])
         self._keep_energies()
         if self.weighs:
-            inputs = [
-                self.starts,
-                self.ends,
-                self.balanced,
-                model.mass,
-                w.x_start,
-                w.u,
-                self.inertial,
-                self.pairs.force_of_vertex,
-            ]
-            device.launch_blocks(
-                k.weigh, self.bodies, [*inputs, model.real.scalar(model.settings.time_step), self.unbalanced], grain=1000
-            )
+            h = model.real.scalar(model.settings.time_step)
+            inputs = [self.balanced, w.x_start, w.u, self.inertial, self.pairs.force_of_vertex, h, self.unbalanced]
+            device.launch_blocks(k.weigh, self.bodies, inputs, grain=1000)
             self.largest_of_bodies.find([self.unbalanced], self.numbers, [status.UNBALANCED])
         if w.script.moves:
             self._find_crowded()
         w.script.advance(w.x_start, w.u, t.fraction, w.count)
-        s = model.settings
-        states = [
-            self.pairs.count,
-            self.hits,
-            self.attempts,
-            w.script.flags,
-            self.project,
-            self.restrained,
-            self.lowered,
-        ]
-        change = BARRIER_CHANGE if self.friction is None else FORCE_CHANGE
-        most_idle = IDLE if self.descends else s.max_outer  # what need not lower the potential does not idle where it does not
-        limits = [model.real.scalar(s.tolerance), model.real.scalar(change), s.max_outer, most_idle, s.budget_ms or 0.0]
-        times = [w.candidates.overflow, w.clock]
-        device.launch_serial(k.decide, [*states, *times, *limits, self.numbers, w.count, w.going])
-        which = [self.islands.label, self.islands.driven, self.squeezed, self.attempts, self.island_least]
-        device.launch_serial(k.restrain, [self.bodies, *which, self.restraint, self.restrained])
+        states = [self.pairs.count, w.script.flags, w.candidates.overflow]
+        device.launch_serial(k.decide, [*states, self.search, self.limits, w.progress()])
+        device.launch_serial(k.restrain, [islands.groups, self.search, self.island_least, self.restraint])

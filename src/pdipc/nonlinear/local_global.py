@@ -10,7 +10,9 @@ from pdipc.barrier.restitution import Restitution
 from pdipc.device.language import kernel
 from pdipc.device.launch import Reducer
 from pdipc.device.precision import Real
+from pdipc.integration import inertia as implicit
 from pdipc.integration import status
+from pdipc.integration.script import led
 from pdipc.linear import Translations
 from pdipc.nonlinear.anderson import Anderson
 from pdipc.nonlinear.descent import Descent
@@ -22,26 +24,21 @@ INNER_TOLERANCE = 0.2  # or by less than this part of its first iteration
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Inertial, Led = real.scalar, real.vec3, implicit.inertial(real), led(real)
     module = real.module(__name__)
 
     @kernel(module)
     def inertia(
         first: int,
         u_tilde: wp.array(dtype=vec3),
-        rest: wp.array(dtype=vec3),
-        z: wp.array(dtype=vec3),
-        mass: wp.array(dtype=scalar),
-        free: wp.array(dtype=scalar),
-        h: scalar,
-        damping: scalar,
+        o: Inertial,
         force_out: wp.array(dtype=vec3),
         increment_out: wp.array(dtype=vec3),
     ):
         """-dE/dx at x~ (line 8), with mass-proportional damping; and a zero start for the increment."""
         i = first + wp.tid()
-        scale = free[i] * mass[i] / h
-        force_out[i] = scale / h * (z[i] - u_tilde[i]) - scale * damping * (u_tilde[i] - rest[i])
+        scale = o.free[i] * o.mass[i] / o.h
+        force_out[i] = scale / o.h * (o.z[i] - u_tilde[i]) - scale * o.damping * (u_tilde[i] - o.rest[i])
         increment_out[i] = vec3()
 
     @kernel(module)
@@ -87,40 +84,28 @@ def kernels(real: Real) -> SimpleNamespace:
             u_out[i] = u_end[i]
 
     @kernel(module)
-    def stay(
-        first: int,
-        u: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
-        u_tilde_out: wp.array(dtype=vec3),
-    ):
+    def stay(first: int, o: Led, u_tilde_out: wp.array(dtype=vec3)):
         """What is scripted and does not set out stays."""
         i = first + wp.tid()
-        if free[i] == scalar(0.0) and mover[i] >= 0 and drive[wp.max(mover[i], 0)] == 0:
-            u_tilde_out[i] = u[i]
+        if o.free[i] == scalar(0.0) and o.mover[i] >= 0 and o.drive[wp.max(o.mover[i], 0)] == 0:
+            u_tilde_out[i] = o.u[i]
 
     @kernel(module)
     def lead(
         first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        target: wp.array(dtype=vec3),
+        o: Led,
         goal: wp.array(dtype=vec3),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
         u_tilde_out: wp.array(dtype=vec3),
         lag_out: wp.array(dtype=scalar),
     ):
         """Where the next outer iteration starts from; what is scripted goes on to its waypoint. lag: m, how far it is from its goal."""
         i = first + wp.tid()
         lag_out[i] = scalar(0.0)
-        u_tilde_out[i] = u[i]
-        if free[i] == scalar(0.0):
-            lag_out[i] = wp.length((goal[i] - base[i]) - u[i])
-            if drive[wp.max(mover[i], 0)] != 0:
-                u_tilde_out[i] = target[i] - base[i]
+        u_tilde_out[i] = o.u[i]
+        if o.free[i] == scalar(0.0):
+            lag_out[i] = wp.length((goal[i] - o.base[i]) - o.u[i])
+            if o.drive[wp.max(o.mover[i], 0)] != 0:
+                u_tilde_out[i] = o.target[i] - o.base[i]
 
     return SimpleNamespace(inertia=inertia, measure=measure, direct=direct, commit=commit, stay=stay, lead=lead)
 
@@ -187,10 +172,9 @@ class Iterations:
 
     def _local_global(self) -> None:
         """Lines 8 to 11: local projections and the global step, at fixed barriers."""
-        w, model, device, k, s = self.work, self.model, self.device, self.kernels, self.model.settings
-        h, damping = model.real.scalar(s.time_step), model.real.scalar(s.damping)
-        inputs = [w.u_tilde, w.rest, w.z, model.mass, model.free, h, damping, self.force, self.increment]
-        device.launch(k.inertia, model.vertex_count, inputs)
+        w, model = self.work, self.model
+        inputs = [w.u_tilde, w.inertial(), self.force, self.increment]
+        self.device.launch(self.kernels.inertia, model.vertex_count, inputs)
         model.projector.add_forces(w.x_start, w.u_tilde, self.rhs, self.force)
         self.pairs.linearize(w.u, w.u_tilde, w.rest, self.rhs)
         self.solve_linear(self.increment, self.rhs)
@@ -220,8 +204,7 @@ class Iterations:
 
     def _lead(self) -> None:
         w, n = self.work, self.model.vertex_count
-        aims = [w.script.target, w.script.goal, w.script.mover, w.script.drive]
-        self.device.launch(self.kernels.lead, n, [w.x_start, w.u, self.model.free, *aims, w.u_tilde, self.lags])
+        self.device.launch(self.kernels.lead, n, [w.led(), w.script.goal, w.u_tilde, self.lags])
 
 
 class LocalGlobal(Iterations):
@@ -254,8 +237,7 @@ class LocalGlobal(Iterations):
         self.descent.start()
         w = self.work
         if w.script.moves:
-            movers = [w.script.mover, w.script.drive]
-            self.device.launch(self.kernels.stay, self.model.vertex_count, [w.u, self.model.free, *movers, w.u_tilde])
+            self.device.launch(self.kernels.stay, self.model.vertex_count, [w.led(), w.u_tilde])
 
     def solve(self) -> None:
         """Lines 6 to 12."""

@@ -8,8 +8,8 @@ as `descent` has it, over the displacements u since the start of the step. Its H
 conjugate gradients solve for the step (Section 4.3: "any existing Hessian-free nonlinear programming ... could fit in Alg. 1").
 
 The step is straight, and a straight step that rotates a body stretches it, by the square of the angle: for a body of steel more than a few
-microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So where no vertex of a
-body is held, the part of the step that rotates the body as a whole becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
+microns cost more than they win, and a stretched body resists the rest of its rotation, so that the next step looks small. So the part of the step
+that rotates the body as a whole, about what holds it if something does, becomes a rotation: x~ = x + p + (R(w) - I - [w]) (x - c). It changes
 p by its square, so it descends as p does, and solves as fast as p where that is small. A step that would rotate by more than a radian is made in part.
 
 Where the Hessian is indefinite the projected one takes its place, whose bound makes steps creep along directions that the potential curves down in; as
@@ -34,10 +34,11 @@ from pdipc.barrier import exact, friction
 from pdipc.barrier.pairs import Exerted
 from pdipc.barrier.restitution import Restitution
 from pdipc.device import blocks
-from pdipc.device.language import func, kernel
+from pdipc.device.language import kernel, struct
 from pdipc.device.launch import Largest
 from pdipc.device.precision import Real
 from pdipc.integration import status
+from pdipc.integration.script import led
 from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
@@ -45,6 +46,7 @@ from pdipc.linear.wide_pcg import WidePcg
 from pdipc.nonlinear.descent import Descent, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
+GRIP = 1.0e6  # how much more than all of them those weigh that are held
 MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
@@ -57,16 +59,18 @@ REBOUND_TOLERANCE = {
 }  # of the one solve for restitution: what is left of it acts as from outside
 
 
-@func
-def sampled(k: int, number: int, count: int) -> int:
-    """The k-th of `number` of `count` vertices: all where they are few, else spread, and not along the rows of a grid."""
-    # In Warp's language the quotient of integers is one.
-    return (k * count) / number + (k * 37) % (count / number)
+@struct
+class Samples:
+    """The vertices of each body that tell how it rotates; see `samples_of`."""
+
+    starts: wp.array[wp.int32]
+    vertices: wp.array[wp.int32]
+    weights: wp.array[wp.float64]  # kg
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Led = real.scalar, real.vec3, led(real)
     module = real.module(__name__)
     wide = wp.float64
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
@@ -115,38 +119,28 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def look_ahead(
         first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        o: Led,
         z: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
         ahead_out: wp.array(dtype=vec3),
         driven_out: wp.array(dtype=wp.int32),
     ):
         """Where vertices are going: what is driven to its target, others as inertia has it in the first iteration, and nowhere later."""
         i = first + wp.tid()
-        place = base[i] + u[i]
+        place = o.base[i] + o.u[i]
         driven_out[i] = 0
-        if free[i] == scalar(0.0):
-            if drive[wp.max(mover[i], 0)] != 0 and mover[i] >= 0:
-                place = target[i]
+        if o.free[i] == scalar(0.0):
+            if o.drive[wp.max(o.mover[i], 0)] != 0 and o.mover[i] >= 0:
+                place = o.target[i]
                 driven_out[i] = 1
         elif count[status.OUTER] == 0:
-            place = base[i] + z[i]
+            place = o.base[i] + z[i]
         ahead_out[i] = place
 
     @kernel(module)
     def begin(
         first: int,
-        u: wp.array(dtype=vec3),
-        base: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
+        o: Led,
         barrier: wp.array(dtype=vec3),
         friction: wp.array(dtype=vec3),
         rhs: wp.array(dtype=vec3),
@@ -157,18 +151,15 @@ def kernels(real: Real) -> SimpleNamespace:
         total = rhs[i] + barrier[i]
         if friction:
             total += friction[i]
-        rhs[i] = free[i] * total
+        rhs[i] = o.free[i] * total
         p_out[i] = vec3()
-        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
-            p_out[i] = (target[i] - base[i]) - u[i]
+        if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
+            p_out[i] = (o.target[i] - o.base[i]) - o.u[i]
 
     @kernel(module)
     def find_turn(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        whole: wp.array(dtype=wp.int32),
-        mass: wp.array(dtype=scalar),
+        bodies: Samples,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -177,23 +168,20 @@ def kernels(real: Real) -> SimpleNamespace:
         turn_out: wp.array(dtype=wp.vec3d),
         part_out: wp.array(dtype=scalar),
     ):
-        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point; nothing where some of its vertices are held.
+        """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point, as its samples tell.
         A part of the step is made where all of it would rotate by more than MOST_TURN."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        start = starts[b]
-        count = ends[b] - start
-        number = wp.min(count, SAMPLES)
-        if whole[b] == 0:
-            number = 0
-        origin = base[start]
+        start = bodies.starts[b]
+        end = bodies.starts[b + 1]
+        origin = base[bodies.vertices[start]]
         total = wide(0.0)
         center = wp.vec3d()
         mean = wp.vec3d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = bodies.vertices[k]
+            m = bodies.weights[k]
             total += m
             center += m * widened((base[i] - origin) + u[i])
             mean += m * widened(p[i])
@@ -206,9 +194,9 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = wp.vec3d()
         square = wide(0.0)
         outer = wp.mat33d()
-        for k in range(lane, number, wp.block_dim()):
-            i = start + sampled(k, number, count)
-            m = wide(mass[i])
+        for k in range(start + lane, end, wp.block_dim()):
+            i = bodies.vertices[k]
+            m = bodies.weights[k]
             arm = widened((base[i] - origin) + u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
@@ -216,32 +204,26 @@ def kernels(real: Real) -> SimpleNamespace:
         momentum = total_vector(momentum)
         square = total_number(square)
         outer = total_matrix(outer)
-        turn = wp.vec3d()
-        if number > 0:
-            turn = wide(stretch[0]) * turned(square, outer, momentum)
+        if lane == 0:
+            turn = wp.vec3d()
+            if square > wide(0.0):
+                turn = wide(stretch[0]) * turned(square, outer, momentum)
             if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
-        if lane == 0:
             part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
-            turn = part * turn
-            part_out[b] = scalar(part)
             center_out[b] = widened(origin) + center
-            turn_out[b] = turn
+            turn_out[b] = part * turn
+            part_out[b] = scalar(part)
 
     @kernel(module)
     def propose(
         first: int,
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        o: Led,
         p: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
         body: wp.array(dtype=wp.int32),
         center: wp.array(dtype=wp.vec3d),
         turn: wp.array(dtype=wp.vec3d),
         part: wp.array(dtype=scalar),
-        target: wp.array(dtype=vec3),
-        mover: wp.array(dtype=wp.int32),
-        drive: wp.array(dtype=wp.int32),
         stretch: wp.array(dtype=scalar),
         u_tilde_out: wp.array(dtype=vec3),
         x_tilde_out: wp.array(dtype=vec3),
@@ -253,17 +235,17 @@ def kernels(real: Real) -> SimpleNamespace:
         if not (moved < scalar(1.0e30)):
             moved = scalar(wp.inf)
             step = vec3()
-        if free[i] > scalar(0.0):
+        if o.free[i] > scalar(0.0):
             step = stretch[0] * step
         b = body[i]
-        if b >= 0 and moved < scalar(wp.inf):
+        if b >= 0 and o.free[i] > scalar(0.0) and moved < scalar(wp.inf):
             step = part[wp.max(b, 0)] * step
-            step += vec3(curved(widened(base[i] + u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
-        u_tilde = u[i] + step
-        if free[i] == scalar(0.0) and drive[wp.max(mover[i], 0)] != 0:
-            u_tilde = target[i] - base[i]  # to the bit, so that it is known to have arrived
+            step += vec3(curved(widened(o.base[i] + o.u[i]) - center[wp.max(b, 0)], turn[wp.max(b, 0)]))
+        u_tilde = o.u[i] + step
+        if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
+            u_tilde = o.target[i] - o.base[i]  # to the bit, so that it is known to have arrived
         u_tilde_out[i] = u_tilde
-        x_tilde_out[i] = base[i] + u_tilde
+        x_tilde_out[i] = o.base[i] + u_tilde
 
     @kernel(module)
     def any_driven(first: int, movers: int, drive: wp.array(dtype=wp.int32), any_out: wp.array(dtype=wp.int32)):
@@ -333,7 +315,40 @@ def kernels(real: Real) -> SimpleNamespace:
         if free[i] > scalar(0.0):
             p[i] = vec3()
 
-    return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
+    return SimpleNamespace(
+        measure=measure,
+        lengthen=lengthen,
+        look_ahead=look_ahead,
+        begin=begin,
+        find_turn=find_turn,
+        propose=propose,
+        any_driven=any_driven,
+        set_flag=set_flag,
+        choose=choose,
+        compare=compare,
+        leave_saddle=leave_saddle,
+        restart=restart,
+    )
+
+
+def samples_of(vertices: np.ndarray, free: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a body that tell how it rotates as a whole, and their weights: masses, and for what is held far more than all of these,
+    so that a body turns about what holds it and not at all where that is more than an axis.
+
+    vertices: (k,); free: (n,) bool; mass: (n,) kg. Returns at most SAMPLES of each kind, (s,) int and (s,) kg.
+    """
+    loose, held = vertices[free[vertices]], vertices[~free[vertices]]
+    loose, held = (_spread(each, SAMPLES) for each in (loose, held))
+    grip = np.full(len(held), GRIP * mass[loose].sum() / max(1, len(held)))
+    return np.concatenate([loose, held]), np.concatenate([mass[loose], grip])
+
+
+def _spread(vertices: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of them: all where they are few, else spread, and not along the rows of a grid."""
+    if len(vertices) <= most:
+        return vertices
+    k, every = np.arange(most), len(vertices) // most
+    return vertices[k * len(vertices) // most + (37 * k) % every]
 
 
 class Newton(Descent):
@@ -344,7 +359,7 @@ class Newton(Descent):
         model = work.model
         device, real, n = model.device, model.real, model.vertex_count
         self.kernels = kernels(real)
-        free = model.free_vertices
+        free, mass = model.free_vertices, model.mass.numpy().astype(np.float64)
         self.matrix = BlockMatrix(device, real, model.projector, model.held, free)
         equations = (device, real, self.matrix, free, PCG_TOLERANCE, PCG_MOST)
         operators = (exact.operator(real), friction.operator(real))
@@ -356,8 +371,13 @@ class Newton(Descent):
         def zeros(dtype, count=n):
             return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
 
-        whole = [free[low:high].all() for low, high in self.ranges]
-        self.whole = wp.array(np.array([*whole, False], dtype=np.int32), device=device.warp)
+        found = [samples_of(np.arange(low, high), free, mass) for low, high in self.ranges]
+        starts = np.cumsum([0, *(len(samples) for samples, _ in found)])
+        samples, weights = (np.concatenate([*side, [0]]) for side in zip(*found, strict=True)) if found else ([0], [0.0])
+        self.samples = Samples()
+        arrays = {"starts": (starts, np.int32), "vertices": (samples, np.int32), "weights": (weights, np.float64)}
+        for name, (values, kind) in arrays.items():
+            setattr(self.samples, name, wp.array(np.asarray(values, dtype=kind), device=device.warp))
         vec3, scalar = real.vec3, real.scalar
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.forces, self.scales = (zeros(scalar) for _ in range(3))
@@ -398,9 +418,9 @@ class Newton(Descent):
 
     def _foresee(self) -> None:
         """What is scripted will push what is in its way: pairs that it is about to close push already, where it will be."""
-        w, model = self.work, self.model
-        inputs = [w.x_start, w.u, w.z, w.script.target, model.free, w.script.mover, w.script.drive, w.count]
-        self.device.launch(self.kernels.look_ahead, model.vertex_count, [*inputs, w.x_tilde, self.driven])
+        w = self.work
+        inputs = [w.led(), w.z, w.count, w.x_tilde, self.driven]
+        self.device.launch(self.kernels.look_ahead, self.model.vertex_count, inputs)
         w.candidates.check(w.x, w.x_tilde)
         self.device.when(w.candidates.needed, lambda: w.candidates.cover(w.x, w.x_tilde))
         self.pairs.freeze(w.candidates, w.x, w.x_tilde, self.driven)
@@ -415,8 +435,8 @@ class Newton(Descent):
         w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
         model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
         friction = None if self.friction is None else self.friction.force_of_vertex
-        where = [w.u, w.x_start, w.script.target, model.free, w.script.mover, w.script.drive]
-        device.launch(k.begin, n, [*where, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        led = w.led()
+        device.launch(k.begin, n, [led, self.pairs.force_of_vertex, friction, self.rhs, self.p])
         if self.affine is not None:
             self.affine.fold(self.rhs)
         device.when(self.renew, self._assemble)
@@ -429,11 +449,9 @@ class Newton(Descent):
         states = [self.project, self.hits, self.attempts, w.count]
         device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
         if self.bodies:
-            inputs = [self.starts, self.ends, self.whole, model.mass, w.x_start, w.u, self.p]
-            inputs += [self.stretch, self.center, self.turn, self.part]
+            inputs = [self.samples, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
-        inputs = [w.x_start, w.u, self.p, model.free, self.islands.body, self.center, self.turn, self.part]
-        inputs += [w.script.target, w.script.mover, w.script.drive, self.stretch]
+        inputs = [led, self.p, self.islands.body, self.center, self.turn, self.part, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
     def _assemble(self) -> None:
@@ -473,22 +491,9 @@ class Newton(Descent):
         self.matrix.restrain(self.islands.body, self.unrestrained)
         self.matrix.assemble(w.x_start, w.u, self.project)
         r.linearize_exact(w.rest)
-        self.device.launch(
-            self.kernels.begin,
-            n,
-            [
-                w.u,
-                w.x_start,
-                w.script.target,
-                model.free,
-                w.script.mover,
-                self.nobody,
-                self.pairs.force_of_vertex,
-                None,
-                r.zero,
-                self.p,
-            ],
-        )
+        led = w.led()
+        led.drive = self.nobody
+        self.device.launch(self.kernels.begin, n, [led, self.pairs.force_of_vertex, None, r.zero, self.p])
         couplings = [each for each in self._couplings() if each is not self.friction]
         self.solver.prepare(w.x, couplings)
         self.solver.solve(self.p, r.zero, couplings, 0.0, self.nobody, REBOUND_TOLERANCE[model.real.name])

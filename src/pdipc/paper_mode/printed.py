@@ -1,6 +1,7 @@
 """Lines 5 to 12 and 16 of Algorithm 1 as printed: targets of Eq. (6), plain local-global iterations, and the paper's test."""
 
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -17,10 +18,8 @@ from pdipc.paper_mode.targets import OUTER_SQUARED, PaperPairs
 
 
 @functools.cache
-def kernels(real: Real):
-    from types import SimpleNamespace
-
-    scalar, vec3 = real.scalar, real.vec3
+def kernels(real: Real) -> SimpleNamespace:
+    scalar, vec3, Progress = real.scalar, real.vec3, status.progress(real)
     module = real.module(__name__)
 
     @kernel(module)
@@ -35,46 +34,41 @@ def kernels(real: Real):
         passes: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         script: wp.array(dtype=wp.int32),
-        increment: wp.array(dtype=scalar),
-        clock: wp.array(dtype=wp.float64),
-        tolerance: scalar,
+        committed: wp.array(dtype=scalar),
         max_outer: int,
         budget_ms: wp.float64,
-        committed: wp.array(dtype=scalar),
-        numbers: wp.array(dtype=scalar),
-        count: wp.array(dtype=wp.int32),
-        going_out: wp.array(dtype=wp.int32),
+        progress: Progress,
     ):
         """Line 16 as printed: it looks at the truncated motion, which becomes small because t_I does, converged or not."""
         code = int(status.RUNNING)
-        residual = numbers[status.MOVED]
+        residual = progress.numbers[status.MOVED]
         if overflow[0] != 0:
             code = status.OVERFLOW
         elif residual >= scalar(wp.inf):
             code = status.NOT_FINITE
-            count[status.OUTER] = count[status.OUTER] + 1
+            progress.count[status.OUTER] = progress.count[status.OUTER] + 1
         else:
-            count[status.OUTER] = count[status.OUTER] + 1
-            count[status.SINCE] = count[status.SINCE] + 1
-            count[status.BARRIERS] = pairs[0]
+            progress.count[status.OUTER] = progress.count[status.OUTER] + 1
+            progress.count[status.SINCE] = progress.count[status.SINCE] + 1
+            progress.count[status.BARRIERS] = pairs[0]
             if script[ARRIVED] != 0:
-                count[status.SINCE] = 0
+                progress.count[status.SINCE] = 0
             if passes[0] > 0:
-                count[status.TRUNCATIONS] = count[status.TRUNCATIONS] + 1
-            numbers[status.MOVED] = wp.sqrt(committed[0])
-            small = numbers[status.MOVED] <= wp.sqrt(scalar(OUTER_SQUARED))
+                progress.count[status.TRUNCATIONS] = progress.count[status.TRUNCATIONS] + 1
+            progress.numbers[status.MOVED] = wp.sqrt(committed[0])
+            small = progress.numbers[status.MOVED] <= wp.sqrt(scalar(OUTER_SQUARED))
             if small and script[AHEAD] == 0:
                 code = status.CONVERGED
             elif small and script[WILL] == 0:
                 code = status.LAGGING
-            elif budget_ms > wp.float64(0.0) and clock[status.LAST] - clock[status.STARTED] > budget_ms:
+            elif budget_ms > wp.float64(0.0) and progress.clock[status.LAST] - progress.clock[status.STARTED] > budget_ms:
                 code = status.OUT_OF_TIME
-            elif count[status.SINCE] >= max_outer:
+            elif progress.count[status.SINCE] >= max_outer:
                 code = status.CAPPED
-        count[status.STATUS] = code
-        going_out[0] = 0
+        progress.count[status.STATUS] = code
+        progress.going[0] = 0
         if code == status.RUNNING:
-            going_out[0] = 1
+            progress.going[0] = 1
 
     return SimpleNamespace(measure_squared=measure_squared, decide=decide)
 
@@ -102,10 +96,8 @@ class Printed(Iterations):
 
     def exerted(self) -> tuple[Exerted, Exerted]:
         """See `nonlinear.Method`: what contact did to each body, by Newton's second law, all of it as if along the normals; see `reactions`."""
-        w, model, k = self.work, self.model, self.kernels
-        s, n, real = model.settings, model.vertex_count, model.real
-        inputs = [w.u, w.rest, w.z, model.mass, model.free, real.scalar(s.time_step), real.scalar(s.damping)]
-        self.device.launch(k.inertia, n, [*inputs, self.force, self.increment])
+        w, model = self.work, self.model
+        self.device.launch(self.kernels.inertia, model.vertex_count, [w.u, w.inertial(), self.force, self.increment])
         model.projector.add_forces(w.x_start, w.u, self.rhs, self.force)
         missing = -self.rhs.numpy().astype(np.float64) * model.free_vertices[:, None]
         pushed = [self.pairs.listed(self.pairs.quads, self.pairs.weights, self.pairs.pull)]  # those that pushed last
@@ -128,6 +120,5 @@ class Printed(Iterations):
         self._lead()
         self.largest.max(self.lags, self.numbers, status.LAG)
         s = self.model.settings
-        states = [self.pairs.count, t.passes, w.candidates.overflow, w.script.flags, self.loop.moved, w.clock]
-        limits = [self.model.real.scalar(s.tolerance), s.max_outer, s.budget_ms or 0.0, self.committed]
-        self.device.launch_serial(self.own.decide, [*states, *limits, self.numbers, w.count, w.going])
+        states = [self.pairs.count, t.passes, w.candidates.overflow, w.script.flags, self.committed]
+        self.device.launch_serial(self.own.decide, [*states, s.max_outer, s.budget_ms or 0.0, w.progress()])

@@ -26,6 +26,7 @@ from pdipc.collision.candidates import Candidates
 from pdipc.device.language import kernel
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
+from pdipc.linear.contact_rows import first_entry
 
 INNER_RATE = 1.0e-2  # eps_inner: the inner loop ends when E + Psi + B changes by less than this part
 OUTER_SQUARED = 1.0e-4  # eps_outer, m^2: the outer loop ends when the squared norm of the truncated step is below it
@@ -86,8 +87,6 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather(
         first: int,
-        ends: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
         pairs: Frozen,
         pull: wp.array(dtype=scalar),
         impulse: wp.array(dtype=scalar),
@@ -100,16 +99,13 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """Of each vertex, over its pairs: sum of w, of w (y - x), and of w |y - x|^2 / 2."""
         v = first + wp.tid()
-        low = int(0)
-        if v > 0:
-            low = ends[v - 1]
         total = scalar(0.0)
         drag = vec3()
         offset = scalar(0.0)
         if free[v] > scalar(0.0):
-            for i in range(low, ends[v]):
-                k = entries[i] // 4
-                a = pairs.weights[k][entries[i] % 4]
+            for i in range(first_entry(v, pairs.ends), pairs.ends[v]):
+                k = pairs.entries[i] // 4
+                a = pairs.weights[k][pairs.entries[i] % 4]
                 w = pull[k] * wp.abs(a)
                 y = motion[v] + (a * impulse[k] / mass[v]) * pairs.normals[k]
                 total += w
@@ -191,7 +187,7 @@ class PaperPairs(FrozenPairs):
         k = self.own
         inputs = [self.frozen, self.mass, self.free, self.motion, self.restitution, self.h, self.pull, self.impulse]
         self.device.launch_list(k.project, self.capacity, inputs)
-        inputs = [self.ends, self.entries, self.frozen, self.pull, self.impulse, self.mass, self.free, self.motion]
+        inputs = [self.frozen, self.pull, self.impulse, self.mass, self.free, self.motion]
         self.device.launch(k.gather, len(x), [*inputs, self.scalar, self.drag, self.offset])
 
     def linearize(self, x: wp.array, x_tilde: wp.array, x_start: wp.array, rhs: wp.array) -> None:

@@ -87,7 +87,7 @@ class Run:
 
     def graph(self, count: int) -> Graph:
         """The recorded solve with `count` iterations; what depends on the matrix alone is prepared."""
-        self.solver.limits[1] = count * (self.solver.order if isinstance(self.solver, MatrixPowers) else 1)
+        self.solver.max_iterations = count * (self.solver.order if isinstance(self.solver, MatrixPowers) else 1)
         return self.system.device.capture(lambda: self.solver.solve(self.x, self.b, prepared=True), self.solver)
 
     def result(self, count: int) -> np.ndarray:

@@ -129,6 +129,11 @@ class AssembledPin:
     weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
+    def label(self) -> str:
+        """The pin without its selection, such as body "sheet", pins[0]."""
+        return self.where.rpartition(".select = ")[0]
+
+    @property
     def exact(self) -> bool:
         """Whether it holds vertices exactly, now."""
         return self.active and self.stiffness is None and len(self.vertices) > 0

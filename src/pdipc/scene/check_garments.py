@@ -86,7 +86,7 @@ def _stretched(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
 def _across(assembly: Assembly, body: AssembledBody) -> Iterator[Finding]:
     """Woven cloth with triangles that have no direction of warp."""
     m = body.material
-    if not isinstance(m, ClothMaterial) or not m.is_woven:
+    if not isinstance(m, ClothMaterial) or not m.has_warp:
         return
     shape = body.elastic_shape
     corners = assembly.rest_positions[body.triangles] if shape is None else shape[0].reshape(-1, 3, 3)

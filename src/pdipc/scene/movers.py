@@ -84,7 +84,7 @@ def movers_of(assembly: Assembly) -> list[Mover]:
     for number, pin in enumerate(assembly.pins):
         if pin.exact and pin.follow < 0:
             deviation = assembly.activation_distance
-            found.append(Mover(pin.where, pin.vertices, pin.points, pin.trajectory, -1, number, deviation, np.zeros(3)))
+            found.append(Mover(pin.label, pin.vertices, pin.points, pin.trajectory, -1, number, deviation, np.zeros(3)))
     return found
 
 

@@ -412,7 +412,7 @@ class ClothMaterial(Table):
     )
     warp: Vector | None = Field(
         default=None,
-        description="Direction of the warp of woven cloth in the coordinates of the flat rest shape, else of the mesh; absent: (1, 0, 0).",
+        description="Direction of the warp of woven cloth, in the coordinates of the flat rest shape, else of the mesh; absent: (1, 0, 0).",
     )
     strain_limit: Positive | None = Field(
         default=None,
@@ -431,6 +431,12 @@ class ClothMaterial(Table):
         le=1e6,
         description="Flexural rigidity, N m; absent: membrane_stiffness thickness^2 / 12 / (1 - poisson_ratio^2).",
     )
+    weft_bending_stiffness: Positive | None = Field(
+        default=None,
+        le=1e6,
+        description="Flexural rigidity of a strip cut along the weft, N m; bending_stiffness is then that of one cut along the warp. "
+        "Absent: alike in all directions.",
+    )
     bending: Literal["quadratic", "curved"] = Field(
         default="quadratic", description='"quadratic" for cloth that is flat at rest, "curved" keeps a curved rest shape.'
     )
@@ -440,8 +446,13 @@ class ClothMaterial(Table):
 
     @property
     def is_woven(self) -> bool:
-        """Whether it is stiffer one way than another."""
+        """Whether its membrane is stiffer one way than another."""
         return self.weft_stiffness is not None or self.shear_stiffness is not None
+
+    @property
+    def has_warp(self) -> bool:
+        """Whether anything of it depends on where its warp lies."""
+        return self.is_woven or self.weft_bending_stiffness is not None
 
     @model_validator(mode="after")
     def _fill(self) -> "ClothMaterial":
@@ -451,8 +462,15 @@ class ClothMaterial(Table):
             for name in ("area_stiffness", "weft_stiffness", "shear_stiffness", "warp"):
                 if getattr(self, name):
                     raise ValueError(f'{name} has no effect on springs; take membrane = "strain"')
-        if self.warp is not None and not (self.is_woven and any(self.warp)):
-            raise ValueError("warp must be a direction, and needs weft_stiffness or shear_stiffness beside it")
+        if self.warp is not None and not (self.has_warp and any(self.warp)):
+            raise ValueError(
+                "warp must be a direction, and needs weft_stiffness, shear_stiffness or weft_bending_stiffness beside it"
+            )
+        if self.weft_bending_stiffness is not None:
+            if self.bending == "curved":
+                raise ValueError('weft_bending_stiffness has no effect on bending = "curved"; take "quadratic"')
+            if bend == 0.0:
+                raise ValueError("weft_bending_stiffness needs a bending_stiffness above 0 beside it, that along the warp")
         if stretch is None or "membrane_stiffness" not in self.model_fields_set:
             stretch = (self.young_modulus or 1e5) * self.thickness
         elif self.young_modulus and not np.isclose(self.young_modulus * self.thickness, stretch, rtol=1e-6):

@@ -44,7 +44,8 @@ def weld(points: np.ndarray, triangles: np.ndarray, within: float, where: str) -
 def opened(points: np.ndarray, triangles: np.ndarray, gap: float) -> np.ndarray:
     """(n, 3) m: the points with rims drawn back into their own panels where others are nearer than `gap`, until these are that far apart.
 
-    A vertex goes towards the middle of the triangles around it, a good half of what is missing in each round. What cannot be opened that way, such as a rim in the middle of another panel, is left for the check to find.
+    A vertex goes towards the middle of the triangles around it, a good half of what is missing in each round, and in all by `gap` or, where that is more, half of its way there. What
+    cannot be opened that way, such as a rim in the middle of another panel or rims that lie on each other and go the same way, is left for the check to find.
     """
     rim = sewing.rim_vertices(triangles)
     used, part = sewing.parts(triangles)
@@ -52,7 +53,7 @@ def opened(points: np.ndarray, triangles: np.ndarray, gap: float) -> np.ndarray:
     of[used] = part
     corner = triangles.ravel()
     count = np.bincount(corner, minlength=len(points))
-    x = points.copy()
+    x, most = points.copy(), None
     for _ in range(ROUNDS):
         near = cKDTree(x[rim]).query_pairs(gap, output_type="ndarray").reshape(-1, 2)
         i, j = rim[near[:, 0]], rim[near[:, 1]]
@@ -66,7 +67,10 @@ def opened(points: np.ndarray, triangles: np.ndarray, gap: float) -> np.ndarray:
         inward = np.stack([np.bincount(corner, weights=middles[:, axis], minlength=len(points)) for axis in range(3)], axis=1)
         inward = inward / np.maximum(count, 1)[:, None] - x
         length = np.linalg.norm(inward, axis=1)
+        most = np.maximum(gap, 0.5 * length) if most is None else most
         moved = missing > 0.0
         step = np.minimum(0.6 * missing[moved] + 0.05 * gap, 0.3 * length[moved])
         x[moved] += (step / np.maximum(length[moved], 1e-300))[:, None] * inward[moved]
+        way = x - points
+        x = points + way * np.minimum(1.0, most / np.maximum(np.linalg.norm(way, axis=1), 1e-300))[:, None]
     return x

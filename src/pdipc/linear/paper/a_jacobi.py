@@ -28,7 +28,7 @@ from numpy.polynomial import Chebyshev as ChebyshevSeries
 from numpy.polynomial import Polynomial
 
 from pdipc.device import language
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct_of
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear import partition
@@ -252,11 +252,15 @@ class AJacobi(Solver):
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         placed = np.zeros(max(1, len(columns)), dtype=np.int32)
         placed[positions] = columns
-        arrays = [starts, vertices, first_rows, placed, offsets]
-        self._group_arrays = [wp.array(np.resize(a, max(1, a.size)).astype(np.int32), device=self.device.warp) for a in arrays]
+        self._neighbourhoods = made = neighbourhoods_of(self.real)()
+        arrays = {"starts": starts, "vertices": vertices, "first_rows": first_rows, "columns": placed, "offsets": offsets}
+        for name, values in arrays.items():
+            values = np.resize(values, max(1, values.size)).astype(np.int32)
+            setattr(made, name, wp.array(values, device=self.device.warp))
+        made.coefficients = self.zeros(self.real.scalar, len(placed))
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
         self._group_kernels = group_kernels(self.real, limit)
-        return positions, self.zeros(self.real.scalar, len(placed))
+        return positions, made.coefficients
 
     def prepare(self, contact: Contact | None) -> None:
         """Launches the inverse of the diagonal, and with it the A-coefficients (Eq. 14)."""
@@ -271,7 +275,6 @@ class AJacobi(Solver):
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         sums, status_kernels = self.sums, jacobi.kernels(self.real)
@@ -280,14 +283,14 @@ class AJacobi(Solver):
         self._form_constant(x, b)
         self.copy(self._x, x)
         self.copy(self._before, x)
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        status = self.status
         self._sweep(self._x, self._before, -1)
-        sums.conclude(status_kernels.begin, [*self._sum, reference, *self.limits, *status])
+        sums.conclude(status_kernels.begin, [*self._sum, status])
 
         def iterate() -> None:
             self._sweep(self._x, self._before, 0)
             self._sweep(self._before, self._x, 1)
-            sums.conclude(status_kernels.check, [*self._sum, CHECK, CHECK, *self.limits, *status])
+            sums.conclude(status_kernels.check, [*self._sum, CHECK, CHECK, status])
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -298,24 +301,26 @@ class AJacobi(Solver):
 
     def _form_constant(self, x: wp.array, b: wp.array) -> None:
         """Launches q(G) D^-1 b by Horner's rule, with the part of the matrix on prescribed vertices taken to the right."""
-        k, count, matrix = self._kernels, self.system.count, self.system.rows.arguments
+        k, count, matrix = self._kernels, self.system.count, self.system.rows.operand
         self.device.launch(k.prescribed, count, [self.inverse, x, self._v], grain=8)
-        self.device.launch(k.right_side, count, [*matrix, self.inverse, b, self._v, self._before], grain=32)
+        self.device.launch(k.right_side, count, [matrix, self.inverse, b, self._v, self._before], grain=32)
         source, target = self._v, self._constant
         self.device.launch(k.scale, count, [self.inverse, self._before, self._quotient[-1], source], grain=8)
         for d in reversed(self._quotient[:-1]):
-            self.device.launch(k.horner, count, [*matrix, self.inverse, self._before, d, source, target], grain=32)
+            self.device.launch(k.horner, count, [matrix, self.inverse, self._before, d, source, target], grain=32)
             source, target = target, source
         if source is not self._constant:
             self.copy(self._constant, source)
 
     def _sweep(self, source: wp.array, target: wp.array, step: int) -> None:
-        state = [self.total, self._constant, self._factors, self.left, self.limits[1], step, source, target]
+        o = aggregated(self.real)()
+        o.diagonal, o.constant = self.total, self._constant
+        state = [o, jacobi.course_of(self, self._factors), step, source, target]
         if self.grouped:
-            inputs = [*self._group_arrays, self._values, *state, self._group_partial]
+            inputs = [self._neighbourhoods, *state, self._group_partial]
             self.sums.launch_groups(self._group_kernels.grouped_sweep, self.groups, inputs)
         else:
-            self.sums.launch(self._kernels.sweep, [*self.coefficients.arguments, *state, self.partial])
+            self.sums.launch(self._kernels.sweep, [self.coefficients.operand, *state, self.partial])
 
 
 def _quotient(coefficients: np.ndarray) -> np.ndarray:
@@ -324,11 +329,26 @@ def _quotient(coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
+def aggregated(real: Real) -> Any:
+    """A struct: what an aggregated step has beside p(G)."""
+    constant = wp.array(dtype=real.vec3)  # q(G) D^-1 b, m
+    return struct_of("Aggregated", __name__, diagonal=wp.array(dtype=real.scalar), constant=constant)
+
+
+@functools.cache
+def neighbourhoods_of(real: Real) -> Any:
+    """A struct: groups of vertices, what each reads, and its rows of p(G), as `AJacobi._plan` lays them out."""
+    integers = {name: wp.array(dtype=wp.int32) for name in ("starts", "vertices", "first_rows", "columns", "offsets")}
+    return struct_of("Neighbourhoods", __name__, **integers, coefficients=wp.array(dtype=real.scalar))
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     """Kernels over vertices and over entries."""
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Entries = real.scalar, real.vec3, sparse_rows.entries(real)
+    Course, Aggregated = jacobi.course(real), aggregated(real)
     module = real.module(__name__)
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), jacobi.omega_of(real)
 
     @kernel(module)
     def update(
@@ -374,9 +394,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def right_side(
         first: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
+        rows: Entries,
         inverse: wp.array(dtype=scalar),
         b: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -384,7 +402,7 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """D^-1 (b - A x), with x zero on free vertices."""
         i = first + wp.tid()
-        d_out[i] = inverse[i] * (b[i] - f.row_product(i, offsets, columns, values, x))
+        d_out[i] = inverse[i] * (b[i] - f.row_product(i, rows, x))
 
     @kernel(module)
     def scale(
@@ -397,9 +415,7 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def horner(
         first: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
+        rows: Entries,
         inverse: wp.array(dtype=scalar),
         d: wp.array(dtype=vec3),
         factor: scalar,
@@ -408,21 +424,16 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """v_out = factor d + G v."""
         i = first + wp.tid()
-        v_out[i] = factor * d[i] - inverse[i] * f.row_product(i, offsets, columns, values, v)
+        v_out[i] = factor * d[i] - inverse[i] * f.row_product(i, rows, v)
 
     @kernel(module)
     def sweep(
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        coefficients: Entries,
+        o: Aggregated,
+        course: Course,
         step: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -430,20 +441,18 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         """One aggregated step; `before` as in Jacobi's sweep. Step -1: only the norm of the step."""
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = factors[max_iterations - left[0] + step]
+        omega = omega_of_step(course, step)
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
-            if diagonal[i] > scalar(0.0):
-                y = constant[i] + f.row_product(i, offsets, columns, coefficients, x)
+            if o.diagonal[i] > scalar(0.0):
+                y = o.constant[i] + f.row_product(i, coefficients, x)
                 d = y - x[i]
-                gamma += diagonal[i] * wp.dot(d, d)
+                gamma += o.diagonal[i] * wp.dot(d, d)
                 last = before[i]
                 before[i] = last + omega * (y - last)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(update=update, prescribed=prescribed, right_side=right_side, scale=scale, horner=horner, sweep=sweep)
 
 
 # The group's neighbourhood and, stretch by stretch, its coefficients are fetched to fast memory by all threads together; SEGMENTS
@@ -461,15 +470,15 @@ _GROUPED_SWEEP = """
     int staged_column[STAGE];
     const int segments = 1;
 #endif
-    const int base = starts.data[group];
-    const int count = starts.data[group + 1] - base;
-    const int* vertex = vertices.data + base;
+    const int base = groups.starts.data[group];
+    const int count = groups.starts.data[group + 1] - base;
+    const int* vertex = groups.vertices.data + base;
     for (int k = lane; k < count; k += lanes) {
         const auto& p = x.data[vertex[k]];
         cache[3 * k] = p.c[0]; cache[3 * k + 1] = p.c[1]; cache[3 * k + 2] = p.c[2];
     }
-    const int* offset = offsets.data + first_rows.data[group];
-    const int rows = first_rows.data[group + 1] - first_rows.data[group];
+    const int* offset = groups.offsets.data + groups.first_rows.data[group];
+    const int rows = groups.first_rows.data[group + 1] - groups.first_rows.data[group];
     const int segment = lane % segments, at_once = lanes / segments;
     SCALAR gamma = 0;
     for (int first = 0; first < rows; first += at_once) {
@@ -481,8 +490,8 @@ _GROUPED_SWEEP = """
             const int stop = begin + STAGE < end ? begin + STAGE : end;
             MEET;  // the last stretch was used, or the neighbourhood is complete
             for (int e = begin + lane; e < stop; e += lanes) {
-                staged[e - begin] = coefficients.data[e];
-                staged_column[e - begin] = columns.data[e];
+                staged[e - begin] = groups.coefficients.data[e];
+                staged_column[e - begin] = groups.columns.data[e];
             }
             MEET;
             int e = low > begin ? low : begin;
@@ -502,13 +511,13 @@ _GROUPED_SWEEP = """
             const int v = vertex[row];
             SCALAR square = 0;
             for (int c = 0; c < 3; ++c) {
-                y[c] += constant.data[v].c[c];
+                y[c] += o.constant.data[v].c[c];
                 const SCALAR d = y[c] - cache[3 * row + c];
                 square += d * d;
                 SCALAR& last = before.data[v].c[c];
                 last += omega * (y[c] - last);
             }
-            gamma += diagonal.data[v] * square;
+            gamma += o.diagonal.data[v] * square;
         }
     }
     return gamma;
@@ -526,8 +535,9 @@ def capacity_on_cuda(real: Real) -> int:
 def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     """The kernel for groups that read up to `capacity` vertices."""
     scalar, vec3 = real.scalar, real.vec3
+    Course, Aggregated, Neighbourhoods = jacobi.course(real), aggregated(real), neighbourhoods_of(real)
     module = real.module(f"{__name__}.{capacity}")
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), jacobi.omega_of(real)
     source = (
         _GROUPED_SWEEP.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)).replace("STAGE", str(STAGE))
     )
@@ -537,14 +547,8 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
         group: int,
         lane: int,
         lanes: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        first_rows: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
+        groups: Neighbourhoods,
+        o: Aggregated,
         omega: scalar,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -553,17 +557,9 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     @kernel(module)
     def grouped_sweep(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        first_rows: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        coefficients: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
-        constant: wp.array(dtype=vec3),
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        groups: Neighbourhoods,
+        o: Aggregated,
+        course: Course,
         step: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
@@ -571,28 +567,11 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     ):
         """As `sweep`, for one group of vertices."""
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = factors[max_iterations - left[0] + step]
+        omega = omega_of_step(course, step)
         lanes = wp.block_dim()
         group = worker // lanes
         lane = worker % lanes
-        gamma = group_step(
-            group,
-            lane,
-            lanes,
-            starts,
-            vertices,
-            first_rows,
-            columns,
-            offsets,
-            coefficients,
-            diagonal,
-            constant,
-            omega,
-            x,
-            before,
-        )
+        gamma = group_step(group, lane, lanes, groups, o, omega, x, before)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(grouped_sweep=grouped_sweep)

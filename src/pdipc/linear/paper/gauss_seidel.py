@@ -65,13 +65,11 @@ class Sor(Solver):
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         apply = contact.apply if contact is not None else None
         status_kernels = jacobi.kernels(self.real)
-        matrix = [*self.system.rows.arguments, self.held, self.inverse, self.inverse_block, b]
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
+        equation, status = self.equation(b), self.status
         if not prepared:
             self.prepare(contact)
         self.copy(self._x, x)
@@ -82,15 +80,15 @@ class Sor(Solver):
                 apply(self._x, self._w)
 
         couple()
-        self.sums.launch(self._kernels.residual, [*matrix, self._w, self._x, self.partial])
-        self.sums.conclude(status_kernels.begin, [self.partial, self.sums.slots, reference, *self.limits, *status])
+        self.sums.launch(self._kernels.residual, [equation, self._w, self._x, self.partial])
+        self.sums.conclude(status_kernels.begin, [self.partial, self.sums.slots, status])
 
         def iterate() -> None:
             couple()
             for sums, vertices, slot in self._groups:
-                inputs = [*matrix, self.real.scalar(self.omega), self._w, self._x, vertices, slot, self._sweep_partial]
+                inputs = [equation, self.real.scalar(self.omega), self._w, self._x, vertices, slot, self._sweep_partial]
                 sums.launch(self._kernels.sweep, inputs)
-            self.sums.conclude(status_kernels.check, [self._sweep_partial, self._slots, 1, 1, *self.limits, *status])
+            self.sums.conclude(status_kernels.check, [self._sweep_partial, self._slots, 1, 1, status])
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -106,7 +104,7 @@ class GaussSeidel(Sor):
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     """The residual, and the sweep over one colour."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3, Equation = real.scalar, real.vec3, shared.equation(real)
     module = real.module(__name__)
     f = shared.functions(real)
 
@@ -115,13 +113,7 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        held: wp.array(dtype=scalar),
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
+        k: Equation,
         w: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
@@ -129,9 +121,9 @@ def kernels(real: Real) -> SimpleNamespace:
         worker = first + wp.tid()
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
-            if inverse[i] != scalar(0.0):
-                r = b[i] - w[i] - held[i] * x[i] - f.row_difference(i, offsets, columns, values, x)
-                gamma += wp.dot(r, f.precondition(i, inverse, inverse_block, r))
+            if k.inverse[i] != scalar(0.0):
+                r = k.b[i] - w[i] - k.held[i] * x[i] - f.row_difference(i, k.rows, x)
+                gamma += wp.dot(r, f.precondition(i, k, r))
         f.store_sum(gamma, worker, partial_out)
 
     @kernel(module)
@@ -139,13 +131,7 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        held: wp.array(dtype=scalar),
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
+        k: Equation,
         omega: scalar,
         w: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -155,13 +141,13 @@ def kernels(real: Real) -> SimpleNamespace:
     ):
         worker = first + wp.tid()
         gamma = scalar(0.0)
-        for k in range(worker * share, wp.min((worker + 1) * share, count)):
-            i = vertices[k]
+        for n in range(worker * share, wp.min((worker + 1) * share, count)):
+            i = vertices[n]
             own = x[i]
-            r = b[i] - w[i] - held[i] * own - f.row_difference(i, offsets, columns, values, x)
-            u = f.precondition(i, inverse, inverse_block, r)
+            r = k.b[i] - w[i] - k.held[i] * own - f.row_difference(i, k.rows, x)
+            u = f.precondition(i, k, r)
             gamma += wp.dot(r, u)
             x[i] = own + omega * u
         f.store_sum(gamma, worker + slot * wp.block_dim(), partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(residual=residual, sweep=sweep)

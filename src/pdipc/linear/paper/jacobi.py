@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from pdipc.device.language import kernel
+from pdipc.device.language import Function, func, kernel, struct_of
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
 from pdipc.linear.solver import Contact, Solver
@@ -59,21 +59,20 @@ class Jacobi(Solver):
         self._kernels = kernels(self.real)
 
     @property
-    def weights(self) -> list[Any]:
-        """w, the factors omega, and what tells the number of the sweep."""
-        return [self.real.scalar(self.weight), self._factors, self.left, self.limits[1]]
+    def course(self) -> Any:
+        """The struct of the weights of all sweeps."""
+        return course_of(self, self._factors, self.weight)
 
-    def sweep(self, source: wp.array, target: wp.array, step: int, b: wp.array, coupled: int = 0) -> None:
+    def sweep(self, equation: Any, source: wp.array, target: wp.array, step: int, coupled: bool = False) -> None:
         """Launches the sweep number `step` of the current group of sweeps, or with -1 only the residual of `source`."""
-        matrix = [*self.system.rows.arguments, self.held, self.inverse, self.inverse_block, b]
-        self.sums.launch(self._kernels.sweep, [*matrix, *self.weights, step, coupled, self._w, source, target, self.partial])
+        inputs = [equation, self.course, step, self._w if coupled else None, source, target, self.partial]
+        self.sums.launch(self._kernels.sweep, inputs)
 
     def solve(
         self,
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         apply = contact.apply if contact is not None else None
@@ -84,21 +83,23 @@ class Jacobi(Solver):
         if apply:
             self.clear(self._w)
 
+        equation, status = self.equation(b), self.status
+
         def sweep(source: wp.array, target: wp.array, step: int) -> None:
             if apply:
                 apply(source, self._w)
-            self.sweep(source, target, step, b, int(apply is not None))
+            self.sweep(equation, source, target, step, apply is not None)
 
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
         sweep(self._x, self._before, -1)
-        self.sums.conclude(self._kernels.begin, [self.partial, self.sums.slots, reference, *self.limits, *status])
+        self.sums.conclude(self._kernels.begin, [self.partial, self.sums.slots, status])
 
         def iterate() -> None:
             for step in range(0, self.chunk, 2):
                 sweep(self._x, self._before, step)
                 sweep(self._before, self._x, step + 1)
-            check = [self.partial, self.sums.slots, self.chunk, self.chunk // self.order, *self.limits, *status]
-            self.sums.conclude(self._kernels.check, check)
+            self.sums.conclude(
+                self._kernels.check, [self.partial, self.sums.slots, self.chunk, self.chunk // self.order, status]
+            )
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -111,92 +112,94 @@ class Chebyshev(Jacobi):
 
 
 @functools.cache
+def course(real: Real) -> Any:
+    """A struct: the weights of the sweeps of a solve, and what tells which sweep it is."""
+    return struct_of(
+        "Course",
+        __name__,
+        weight=real.scalar,  # w
+        factors=wp.array(dtype=real.scalar),  # omega of each sweep
+        left=wp.array(dtype=wp.int32),  # (1,) sweeps that are left of
+        max_iterations=int,
+    )
+
+
+@functools.cache
+def omega_of(real: Real) -> Function:
+    """The factor of sweep number `step` of the current group of sweeps; 0 for step -1."""
+    scalar, Course = real.scalar, course(real)
+
+    @func
+    def omega(course: Course, step: int) -> scalar:
+        factor = scalar(0.0)
+        if step >= 0:
+            factor = course.factors[course.max_iterations - course.left[0] + step]
+        return factor
+
+    return omega
+
+
+def course_of(solver: Solver, factors: wp.array, weight: float = 1.0) -> Any:
+    """The struct for a solver."""
+    made = course(solver.real)()
+    made.weight, made.factors, made.left, made.max_iterations = weight, factors, solver.left, solver.max_iterations
+    return made
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     """The kernels of one sweep."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3 = real.scalar, real.vec3
+    Equation, Status, Course = shared.equation(real), shared.status(real), course(real)
     module = real.module(__name__)
-    f = shared.functions(real)
+    f, omega_of_step = shared.functions(real), omega_of(real)
 
     @kernel(module)
     def sweep(
         first: int,
         share: int,
         count: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        held: wp.array(dtype=scalar),
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
-        weight: scalar,
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        k: Equation,
+        course: Course,
         step: int,
-        coupled: int,
         w: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
         partial_out: wp.array(dtype=scalar),
     ):
-        """One sweep from x: `before` holds the iterate before x, and on return the one after it. Step -1: only the residual."""
+        """One sweep from x: `before` holds the iterate before x, and on return the one after it. Step -1: only the residual.
+
+        w: the contacts' part of K x, which is left zero; absent where they have none.
+        """
         worker = first + wp.tid()
-        omega = scalar(0.0)
-        if step >= 0:
-            omega = factors[max_iterations - left[0] + step]
+        omega = omega_of_step(course, step)
         gamma = scalar(0.0)
         for i in range(worker * share, wp.min((worker + 1) * share, count)):
-            if inverse[i] != scalar(0.0):
+            if k.inverse[i] != scalar(0.0):
                 own = x[i]
-                r = b[i] - held[i] * own - f.row_difference(i, offsets, columns, values, x)
-                if coupled != 0:
+                r = k.b[i] - k.held[i] * own - f.row_difference(i, k.rows, x)
+                if w:
                     r -= w[i]
-                u = f.precondition(i, inverse, inverse_block, r)
+                u = f.precondition(i, k, r)
                 gamma += wp.dot(r, u)
                 last = before[i]
-                before[i] = last + omega * (own + weight * u - last)
-            if coupled != 0:
+                before[i] = last + omega * (own + course.weight * u - last)
+            if w:
                 w[i] = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         f.store_sum(gamma, worker, partial_out)
 
     @kernel(module)
-    def begin(
-        first: int,
-        partial: wp.array(dtype=scalar),
-        slots: int,
-        reference: wp.array(dtype=scalar),
-        tolerance: scalar,
-        max_iterations: int,
-        first_out: wp.array(dtype=scalar),
-        left_out: wp.array(dtype=wp.int32),
-        iterations: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        condition_out: wp.array(dtype=wp.int32),
-    ):
+    def begin(first: int, partial: wp.array(dtype=scalar), slots: int, status: Status):
         lane = first + wp.tid()
         gamma = f.sum_partials(partial, slots, lane)
         if lane == 0:
-            f.begin_status(gamma, reference, tolerance, max_iterations, first_out, left_out, residual_out, condition_out)
+            f.begin_status(gamma, status)
 
     @kernel(module)
-    def check(
-        first: int,
-        partial: wp.array(dtype=scalar),
-        slots: int,
-        sweeps: int,
-        counted: int,
-        tolerance: scalar,
-        max_iterations: int,
-        first_norm: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        iterations: wp.array(dtype=wp.int32),
-        residual_out: wp.array(dtype=scalar),
-        condition_out: wp.array(dtype=wp.int32),
-    ):
+    def check(first: int, partial: wp.array(dtype=scalar), slots: int, sweeps: int, counted: int, status: Status):
         lane = first + wp.tid()
         gamma = f.sum_partials(partial, slots, lane)
         if lane == 0:
-            f.update_status(gamma, sweeps, counted, tolerance, first_norm, left, iterations, residual_out, condition_out)
+            f.update_status(gamma, sweeps, counted, status)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(sweep=sweep, begin=begin, check=check)

@@ -8,13 +8,14 @@ contacts too, and reads the matrix from slow memory once for all sweeps, at the 
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
 from pdipc.device import language
-from pdipc.device.language import kernel
+from pdipc.device.language import kernel, struct_of
 from pdipc.device.launch import BLOCK
 from pdipc.device.precision import Real
 from pdipc.linear import kernels as shared
@@ -37,12 +38,13 @@ _SWEEPS = """
 #endif
     SCALAR* now = first_buffer;
     SCALAR* last = second_buffer;
-    const int base = starts.data[group];
-    const int count = starts.data[group + 1] - base;
-    const int* vertex = vertices.data + base;
-    const int* first_entry = offsets.data + row_starts.data[group];
-    const int* column = columns.data;
-    const SCALAR* value = values.data;
+    const int group = worker / lanes, lane = worker % lanes, order = rings.order;
+    const int base = rings.starts.data[group];
+    const int count = rings.starts.data[group + 1] - base;
+    const int* vertex = rings.vertices.data + base;
+    const int* first_entry = rings.offsets.data + rings.row_starts.data[group];
+    const int* column = rings.columns.data;
+    const SCALAR* value = rings.values.data;
     for (int k = lane; k < count; k += lanes) {
         for (int c = 0; c < 3; ++c) {
             now[3 * k + c] = x.data[vertex[k]].c[c];
@@ -50,14 +52,14 @@ _SWEEPS = """
         }
     }
     SYNC;
-    const int own = updated.data[group * order + order - 1];
+    const int own = rings.updated.data[group * order + order - 1];
     SCALAR gamma = 0;
     for (int t = 0; t < order; ++t) {
-        const int rows = updated.data[group * order + t];
-        const SCALAR omega = factors.data[done + t];
+        const int rows = rings.updated.data[group * order + t];
+        const SCALAR omega = course.factors.data[done + t];
         for (int k = lane; k < rows; k += lanes) {
             const int v = vertex[k];
-            const SCALAR factor = inverse.data[v];
+            const SCALAR factor = equation.inverse.data[v];
             if (factor == 0) { continue; }
             SCALAR r[3], u[3];
             const int low = first_entry[k], high = first_entry[k + 1];
@@ -76,18 +78,18 @@ _SWEEPS = """
             if (e < high) { sum += value[e] * *(const four*)(now + 3 * column[e]); }
             sum += odd;
 #endif
-            for (int c = 0; c < 3; ++c) { r[c] = b.data[v].c[c] - diagonal.data[v] * now[3 * k + c] - sum[c]; }
+            for (int c = 0; c < 3; ++c) { r[c] = equation.b.data[v].c[c] - equation.total.data[v] * now[3 * k + c] - sum[c]; }
             for (int c = 0; c < 3; ++c) {
                 u[c] = factor * r[c];
                 if (factor < 0) {
-                    const auto& m = inverse_block.data[v];
+                    const auto& m = equation.inverse_block.data[v];
                     u[c] = m.data[c][0] * r[0] + m.data[c][1] * r[1] + m.data[c][2] * r[2];
                 }
             }
             if (t == 0 && k < own) { gamma += r[0] * u[0] + r[1] * u[1] + r[2] * u[2]; }
             for (int c = 0; c < 3; ++c) {
                 SCALAR& old = last[3 * k + c];
-                old += omega * (now[3 * k + c] + weight * u[c] - old);
+                old += omega * (now[3 * k + c] + course.weight * u[c] - old);
             }
         }
         SYNC;
@@ -123,7 +125,7 @@ class MatrixPowers(jacobi.Chebyshev):
     @property
     def bytes(self) -> int:
         """Memory of the groups' rows and indices on the device."""
-        return sum(array.capacity for array in self._group_arrays)
+        return sum(getattr(self._rings, name).capacity for name in RINGS)
 
     def _plan(self, group: int | None) -> None:
         """Groups, their rings and their rows; smaller groups until they fit into fast memory."""
@@ -157,14 +159,13 @@ class MatrixPowers(jacobi.Chebyshev):
         columns = position - starts[np.repeat(owner[row], lengths)]
         row_starts = np.concatenate([[0], np.cumsum(np.bincount(owner[row], minlength=self.groups))])
         offsets = np.concatenate([[0], np.cumsum(lengths)])
-        self.extra_work = float(row.sum() / max(1, (ring == 0).sum()))
 
-        def integers(values: np.ndarray) -> wp.array:
-            return wp.array(np.resize(values, max(1, values.size)).astype(np.int32), device=self.device.warp)
-
-        data = np.resize(matrix.data[entries], max(1, len(entries))).astype(self.real.numpy)
-        self._group_arrays = [integers(starts), integers(vertices), integers(updated.ravel()), integers(row_starts)]
-        self._group_arrays += [integers(offsets), integers(columns), wp.array(data, device=self.device.warp)]
+        arrays = (starts, vertices, updated.ravel(), row_starts, offsets, columns, matrix.data[entries])
+        self._rings = rings(self.real)()
+        self._rings.order = order
+        for name, values in zip(RINGS, arrays, strict=True):
+            values = np.resize(values, max(1, values.size)).astype(self.real.numpy if name == "values" else np.int32)
+            setattr(self._rings, name, wp.array(values, device=self.device.warp))
         self._group_partial = self.zeros(self.real.scalar, max(1, self.groups))
 
     def solve(
@@ -172,30 +173,27 @@ class MatrixPowers(jacobi.Chebyshev):
         x: wp.array,
         b: wp.array,
         contact: Contact | None = None,
-        reference: wp.array | None = None,
         prepared: bool = False,
     ) -> None:
         if contact is not None and contact.apply is not None:
-            super().solve(x, b, contact, reference, prepared)
+            super().solve(x, b, contact, prepared)
             return
         if not prepared:
             self.prepare(contact)
         for buffer in (self._x, self._before, self._x2, self._before2):
             self.copy(buffer, x)
-        status = [self.first, self.left, self.iterations, self.residual, self.condition]
-        self.sweep(self._x, self._before, -1, b)
-        self.sums.conclude(self._kernels.begin, [self.partial, self.sums.slots, reference, *self.limits, *status])
-        diagonal = [self.total, self.inverse, self.inverse_block]
+        equation, status = self.equation(b), self.status
+        self.sweep(equation, self._x, self._before, -1)
+        self.sums.conclude(self._kernels.begin, [self.partial, self.sums.slots, status])
 
         def run(step: int, source: tuple[wp.array, wp.array], target: tuple[wp.array, wp.array]) -> None:
-            inputs = [*self._group_arrays, *diagonal, b, *self.weights, step, self.order]
-            inputs += [*source, *target, self._group_partial]
+            inputs = [self._rings, equation, self.course, step, *source, *target, self._group_partial]
             self.sums.launch_groups(self._grouped.sweeps, self.groups, inputs)
 
         def iterate() -> None:
             run(0, (self._x, self._before), (self._x2, self._before2))
             run(self.order, (self._x2, self._before2), (self._x, self._before))
-            self.sums.conclude(self._kernels.check, [self._group_partial, self.groups, self.chunk, 2, *self.limits, *status])
+            self.sums.conclude(self._kernels.check, [self._group_partial, self.groups, self.chunk, 2, status])
 
         self.device.loop(self.condition, iterate)
         self.copy(x, self._x)
@@ -206,33 +204,32 @@ def capacity_on_cuda(real: Real) -> int:
     return SHARED_BYTES // (6 * real.numpy.itemsize) - 1
 
 
+RINGS = ("starts", "vertices", "updated", "row_starts", "offsets", "columns", "values")
+
+
+@functools.cache
+def rings(real: Real) -> Any:
+    """A struct: groups of vertices with their rings and their rows, as `MatrixPowers._plan` lays them out."""
+    arrays = {name: wp.array(dtype=real.scalar if name == "values" else wp.int32) for name in RINGS}
+    return struct_of("Rings", __name__, order=int, **arrays)
+
+
 @functools.cache
 def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     """The kernel for groups that need memory for up to `capacity` vertices."""
-    scalar, vec3, mat33 = real.scalar, real.vec3, real.mat33
+    scalar, vec3 = real.scalar, real.vec3
+    Rings, Equation, Course = rings(real), shared.equation(real), jacobi.course(real)
     module = real.module(f"{__name__}.{capacity}")
     f = shared.functions(real)
 
     @language.func_native(_SWEEPS.replace("SCALAR", f"wp::{real.name}").replace("CAPACITY", str(capacity)))
     def group_sweeps(
-        group: int,
-        lane: int,
+        worker: int,
         lanes: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        updated: wp.array(dtype=wp.int32),
-        row_starts: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
-        weight: scalar,
-        factors: wp.array(dtype=scalar),
+        rings: Rings,
+        equation: Equation,
+        course: Course,
         done: int,
-        order: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
         x_out: wp.array(dtype=vec3),
@@ -242,23 +239,10 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     @kernel(module)
     def sweeps(
         first: int,
-        starts: wp.array(dtype=wp.int32),
-        vertices: wp.array(dtype=wp.int32),
-        updated: wp.array(dtype=wp.int32),
-        row_starts: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=scalar),
-        diagonal: wp.array(dtype=scalar),
-        inverse: wp.array(dtype=scalar),
-        inverse_block: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
-        weight: scalar,
-        factors: wp.array(dtype=scalar),
-        left: wp.array(dtype=wp.int32),
-        max_iterations: int,
+        rings: Rings,
+        equation: Equation,
+        course: Course,
         step: int,
-        order: int,
         x: wp.array(dtype=vec3),
         before: wp.array(dtype=vec3),
         x_out: wp.array(dtype=vec3),
@@ -267,32 +251,8 @@ def group_kernels(real: Real, capacity: int) -> SimpleNamespace:
     ):
         """`order` sweeps for the vertices of each group, and the residual before the first of them."""
         worker = first + wp.tid()
-        group = worker // wp.block_dim()
-        lane = worker % wp.block_dim()
-        gamma = group_sweeps(
-            group,
-            lane,
-            wp.block_dim(),
-            starts,
-            vertices,
-            updated,
-            row_starts,
-            offsets,
-            columns,
-            values,
-            diagonal,
-            inverse,
-            inverse_block,
-            b,
-            weight,
-            factors,
-            max_iterations - left[0] + step,
-            order,
-            x,
-            before,
-            x_out,
-            before_out,
-        )
+        done = course.max_iterations - course.left[0] + step
+        gamma = group_sweeps(worker, wp.block_dim(), rings, equation, course, done, x, before, x_out, before_out)
         f.store_sum(gamma, worker, partial_out)
 
-    return SimpleNamespace(**locals())
+    return SimpleNamespace(sweeps=sweeps)

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
+from physics.scenes import cloth, floor, scene, solid
 
 import pdipc
 from pdipc.integration.loads import Loads
 from pdipc.model import build
-
-from .scenes import cloth, floor, scene, solid
 
 FORCES = [
     {"kind": "wind", "velocity": [3.0, 1.0, -2.0], "start": 0.5},

@@ -16,7 +16,7 @@ from pdipc.output.results import RunError, open_run
 from pdipc.scene.errors import SceneError
 from pdipc.scene.worlds import scenes_of
 
-PAGE = Path(__file__).parents[1] / "docs" / "worlds.md"
+PAGE = Path(__file__).parents[2] / "docs" / "worlds.md"
 FINGER = {"name": "finger", "mesh": {"shape": "box", "size": [0.02, 0.04, 0.06], "cells": [1, 1, 1]}}
 VARIANTS = [
     {"contact.friction": 0.1},

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from physics.scenes import cloth, scene, solid
 
 import pdipc
 from pdipc.device.launch import Device
@@ -9,7 +10,6 @@ from pdipc.judge.certify import certify
 from pdipc.scene.motion import Trajectory
 from pdipc.scene.movers import CHORD, MOST
 from pdipc.scene.schema import Keyframe, Motion
-from physics.scenes import cloth, scene, solid
 
 H, SEPARATION, LENGTH = 0.01, 8e-3, 0.4
 CONTACT = {"minimum_separation": SEPARATION, "activation_distance": 8e-3}

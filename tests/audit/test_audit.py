@@ -4,13 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from physics.scenes import floor, scene, solid
 from typer.testing import CliRunner
 
 import pdipc
 from pdipc.audit import audit, barrier_forces, replay, vertex_forces
 from pdipc.cli import app
-
-from .scenes import floor, scene, solid
 
 G, H, MASS = 9.81, 0.01, 8.0
 
