@@ -67,7 +67,6 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
         patched.setattr(_common, "intersections", not_again)
         patched.setattr(_common, "pictures", not_again)
         assert run(*options, "--steps", 2).exit_code == 0
-    monkeypatch.setattr(table1, "_picture", lambda *_: None)
     monkeypatch.setattr(table1, "_films", lambda *_: None)
     assert run("--rows", "dragon", "-o", tmp_path, "--steps", 3).exit_code == 0
     longer = open_run(tmp_path / "dragon-default")

@@ -148,10 +148,13 @@ def run(
         known = [_known(out, name, each) for each in modes]
         judged = [_row(out, name, each, scene, steps, device) for each in modes]
         found += judged
-        if known != judged or not (out / f"{name}.png").is_file():
-            _picture(out, name, modes)
-            _films(out, name, modes)
+        if known != judged:
+            (out / f"{name}.png").unlink(missing_ok=True)
         _write(out, found, machine, small)
+    for name in chosen:  # after all runs, whose memory is told
+        if not (out / f"{name}.png").is_file():
+            _films(out, name, modes)
+            _picture(out, name, modes)
     _gallery(out, chosen)
     return _conclude(out, found, machine, small)
 
