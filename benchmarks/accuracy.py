@@ -35,7 +35,7 @@ def flattened(small: bool) -> pdipc.Scene:
         x = arrays["V"] - arrays["V"].min(axis=0)
         mesh = {"vertices": 0.5 * x / x[:, 1].max() - np.array([0.0, 0.25, 0.0]), "tets": arrays["T"]}
     body = {"name": "body", "kind": "solid", "mesh": mesh, "material": {"young_modulus": 1e5, "poisson_ratio": 0.3}}
-    board = {"shape": "plane", "size": 3.0}
+    board = triangle(3.0)
     close = {"velocity": (0, -0.3, 0), "end": 0.5}
     above = {"name": "upper", "mesh": board, "rotation": (180, 0, 0), "translation": (0, 0.255, 0), "motion": close}
     close = {"velocity": (0, 0.3, 0), "end": 0.5}
@@ -64,9 +64,14 @@ def three_bodies(small: bool) -> pdipc.Scene:
     ]
     walls = [((0, 0, 0), (0, 0, 0)), ((-0.3, 0.5, 0), (0, 0, -90)), ((0.3, 0.5, 0), (0, 0, 90))]
     walls += [((0, 0.5, -0.3), (90, 0, 0)), ((0, 0.5, 0.3), (-90, 0, 0))]
-    size = {"shape": "plane", "size": 1.0}
-    obstacles = [{"name": f"wall{k}", "mesh": size, "translation": at, "rotation": r} for k, (at, r) in enumerate(walls)]
+    wall = triangle(2.0)
+    obstacles = [{"name": f"wall{k}", "mesh": wall, "translation": at, "rotation": r} for k, (at, r) in enumerate(walls)]
     return scene(bodies, obstacles)
+
+
+def triangle(size: float) -> dict:
+    """One, that faces up: here several in a plane count as the polygon that they make, whose inner edges do not push, in IPC they do."""
+    return {"vertices": np.array([[-1.0, 0.0, -1.0], [0.0, 0.0, 2.0], [1.0, 0.0, -1.0]]) * size, "triangles": [[0, 1, 2]]}
 
 
 def scene(bodies: list, obstacles: list) -> pdipc.Scene:

@@ -9,7 +9,6 @@ Exit code 1 where one differs. Writes benchmarks/results/kills.json.
 """
 
 import argparse
-import contextlib
 import json
 import os
 import random
@@ -72,13 +71,13 @@ def start(arguments: list[str], log: Path, largest_file: int | None = None) -> i
 
         traceback.print_exc()
     finally:
-        signal.pthread_sigmask(
-            signal.SIG_BLOCK, {signal.SIGINT}
-        )  # a second one here would leave by the parent's way, and clear its folder
-        with contextlib.suppress(Exception):
+        try:
+            # A second one here would leave by the parent's way, and clear its folder. One that came before raises here.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             sys.stdout.flush()
             sys.stderr.flush()
-        os._exit(code)
+        finally:
+            os._exit(code)
 
 
 def wait(child: int) -> int:

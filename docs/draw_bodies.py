@@ -137,10 +137,10 @@ def sleeve() -> pdipc.Scene:
         {"bodies": ("front", "back"), "within": 0.2, "select": {"box": [[-1, -1, low], [1, 1, high]]}, "duration": 0.3}
         for low, high in ((0.1, 0.2), (-0.2, -0.1))
     ]
-    bent = {"keyframes": [{"time": 0.4}, {"time": 1.4, "rotation": (0, 0, 50)}], "center": (-0.3, 0, 0)}
+    bent = {"keyframes": [{"time": 0.4}, {"time": 1.4, "rotation": (0, 0, 30)}], "center": (-0.3, 0, 0)}
     arm = {"name": "arm", "mesh": {"shape": "capsule", "radius": 0.05, "length": 0.5, "cells": (8, 10)}}
     arm |= {"rotation": (0, 0, 90), "motion": bent, "look": {"color": "#d8c4b2"}}
-    contact = {"activation_distance": 2e-3, "friction": 0.3}
+    contact = {"activation_distance": 1e-3, "friction": 0.6}
     return pdipc.Scene(bodies=bodies, obstacles=[arm], stitches=seams, contact=contact, simulation={"steps": 150})
 
 
@@ -241,7 +241,7 @@ def main() -> None:
             spent = time.process_time() - spent
             run = pdipc.open_run(f"{folder}/run")
             for frame, axis in zip(frames, axes[0], strict=True):
-                render(run, frame, f"{folder}/{frame}.png", Picture(size=(960, 720), view=view))
+                render(run, frame, f"{folder}/{frame}.png", Picture(size=(960, 720), view=view, obstacles="solid"))
                 axis.imshow(_cropped(plt.imread(f"{folder}/{frame}.png")))
                 axis.set(xticks=[], yticks=[], frame_on=False)
             met = sum(

@@ -1,9 +1,12 @@
 """Python in documents runs as it stands there."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
+
+import pdipc
 
 DOCS = Path(__file__).parents[1] / "docs"
 NEEDS = {"pictures": "pyvista", "rods": "pdipc", "rigid": "pdipc", "materials": "pdipc", "loads": "pdipc"}
@@ -19,3 +22,10 @@ def test_python_of_the_page(page):
     for block in blocks:
         above = text[: block.start(1)].count("\n")  # so that a failure names the line of the page
         exec(compile("\n" * above + block[1], page, "exec"), names)
+
+
+def test_scenes_of_the_pictures_start_as_they_are():
+    for name, (made, frames, _) in runpy.run_path(str(DOCS / "draw_bodies.py"))["PICTURES"].items():
+        scene = made()
+        assert pdipc.check_scene(scene) == [], name
+        assert max(frames) <= scene.simulation.steps

@@ -222,13 +222,13 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     refuse_worlds(scene, "a model")
     assembly.masses = masses
     sim = scene.simulation
-    place = device if isinstance(device, Device) else Device(device or sim.device, thread_count_for(len(assembly.positions)))
-    number = real(_precision(sim.precision, place.is_cuda, unresolved(scene, assembly)))
+    device = device if isinstance(device, Device) else Device(device or sim.device, thread_count_for(len(assembly.positions)))
+    precision = real(_precision(sim.precision, device.is_cuda, unresolved(scene, assembly)))
     told = len(assembly.notes)
-    refuse(scene, assembly, number.name)
-    for note in [*assembly.notes[told:], *(unresolved(scene, assembly) if number.name == "float32" else [])]:
+    refuse(scene, assembly, precision.name)
+    for note in [*assembly.notes[told:], *(unresolved(scene, assembly) if precision.name == "float32" else [])]:
         warnings.warn(note, SceneWarning, stacklevel=2)
-    return _made(scene.settled(), assembly, place, number)
+    return _made(scene.settled(), assembly, device, precision)
 
 
 def _precision(wanted: str, on_cuda: bool, too_stiff: list[str]) -> str:
@@ -243,7 +243,7 @@ def reassembled(model: Model, assembly: Assembly) -> Model:
     return _made(model.scene, assembly, model.device, model.real)
 
 
-def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Model:
+def _made(scene: Scene, assembly: Assembly, device: Device, precision: Real) -> Model:
     settings = _settings(scene, assembly)
     sim, h, n = scene.simulation, settings.time_step, len(assembly.positions)
     free = np.ones(n, dtype=bool)
@@ -258,26 +258,26 @@ def _made(scene: Scene, assembly: Assembly, place: Device, number: Real) -> Mode
     solver = None
     if settings.nonlinear_solver != "newton":
         matrix = constraints.stiffness_matrix(n, sets) + scipy.sparse.diags_array(inertia)
-        solver = _linear_solver(scene, System(place, number, matrix, free))
+        solver = _linear_solver(scene, System(device, precision, matrix, free))
 
     def upload(values: np.ndarray) -> wp.array:
-        return wp.array(np.asarray(values, dtype=number.numpy), device=place.warp)
+        return wp.array(np.asarray(values, dtype=precision.numpy), device=device.warp)
 
     return Model(
         scene=scene,
         assembly=assembly,
         settings=settings,
-        device=place,
-        real=number,
+        device=device,
+        real=precision,
         substeps=sim.substeps,
         mass=upload(mass),
         free=upload(free),
         **{name: upload(values) for name, values in _per_vertex(scene, assembly, mass, free, h).items()},
-        projector=constraints.Projector(place, number, n, sets),
+        projector=constraints.Projector(device, precision, n, sets),
         solver=solver,
         free_vertices=free,
         held=held,
-        surface=_surface(assembly, place),
+        surface=_surface(assembly, device),
         external=ExternalForces(assembly, np.array(sim.gravity), mass, h),
         triangles=assembly.triangles,
         followers=[
@@ -348,11 +348,11 @@ def _per_vertex(scene: Scene, assembly: Assembly, mass: np.ndarray, free: np.nda
     return found
 
 
-def _surface(assembly: Assembly, place: Device) -> surface.Surface:
+def _surface(assembly: Assembly, device: Device) -> surface.Surface:
     keeps_shape = assembly.keeps_shape[assembly.body_of_vertex]
     tolerance = faces.FLAT * assembly.activation_distance
     face = faces.flat_faces(assembly.positions, assembly.triangles, keeps_shape, tolerance)
-    return surface.build(place, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle, face)
+    return surface.build(device, assembly.triangles, assembly.rest_positions, assembly.body_of_vertex, assembly.obstacle, face)
 
 
 def _nonlinear_solver(scene: Scene) -> str:

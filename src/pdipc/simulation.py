@@ -4,6 +4,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,6 +59,7 @@ class Simulation(Controls):
         self.state: State = self.model.initial_state()
         self.work = Work(self.model)
         self.observe = observe
+        self._writer: RunWriter | None = None
 
     @property
     @one_at_a_time
@@ -86,8 +88,40 @@ class Simulation(Controls):
         """One step of the scene's time_step, in its sub-steps; the result's counts are summed over them.
 
         forces: also the forces of contact, `result.forces`, on vertices, bodies and pairs of bodies.
+        Raises RunError where the step is to be recorded and does not follow the last one that was, or there is no room.
         """
-        return replayed(self.stepping(forces))
+        if self._writer is None:
+            return replayed(self.stepping(forces))
+        self._writer.expects(self.steps_done + 1)
+        result = replayed(self.stepping(forces=True))
+        assert result.forces is not None
+        contact = result.forces.arrays(vertices=False)
+        self._writer.append(self.steps_done, self.state.time, self.positions, stats_of(result), contact)
+        return result
+
+    @contextmanager
+    def record(self, folder: str | Path, overwrite: bool = False) -> Iterator[None]:
+        """Within it every step is a frame of a new run folder: what commands did can be looked at, checked and exported as any run.
+
+        The folder holds the scene, which knows nothing of commands, and says in run.json that there may have been some. Results of steps have
+        `forces`, whether asked for or not.
+
+        Raises RunError unless it begins at the start, before the first step or after `reset`, and where the folder does not take a run.
+        """
+        from pdipc.output.results import RunError
+
+        if self._writer is not None or self.steps_done > 0:
+            now = f"{self.steps_done} steps are done" if self._writer is None else f"{self._writer.folder} is being recorded"
+            raise RunError(f"{folder}: a recording begins at the start, and {now}; reset first")
+        with writer_of(self, folder, None, overwrite, live="commands between steps") as writer:
+            writer.append(0, 0.0, self.positions, _ignoring(self))
+            self._writer = writer
+            try:
+                yield
+            finally:
+                self._writer = None
+                if self.steps_done == writer.frames[-1][0]:
+                    writer.checkpoint(self.steps_done, self.state.arrays())
 
     def stepping(self, forces: bool = False) -> Generator[Graph, None, StepResult]:
         """`step` as a task; see `pdipc.drive.stepping`."""
@@ -248,8 +282,18 @@ def begun_run(scene: Scene, folder: str | Path) -> "Run":
     return begun
 
 
-def writer_of(simulation: Simulation, folder: str | Path, begun: "Run | None", overwrite: bool = False) -> "RunWriter":
-    """What writes a simulation's run into `folder`, or goes on with the one that was begun there. Raises RunError."""
+def _ignoring(simulation: Simulation) -> dict[str, Any]:
+    """The record of a start: which bodies ignore each other there."""
+    ignoring = simulation.work.quarantine.names(simulation.state.quarantined)
+    return {"quarantined": ignoring} if ignoring else {}
+
+
+def writer_of(
+    simulation: Simulation, folder: str | Path, begun: "Run | None", overwrite: bool = False, live: str | None = None
+) -> "RunWriter":
+    """What writes a simulation's run into `folder`, or goes on with the one that was begun there. live: what may have led it that is not
+    in its scene. Raises RunError.
+    """
     from pdipc.output.results import RunError, RunWriter
 
     model = simulation.model
@@ -266,6 +310,8 @@ def writer_of(simulation: Simulation, folder: str | Path, begun: "Run | None", o
     meta = {**made_by, "threads": model.device.threads, "solver_dropped": dropped}
     if model.assembly.separated:
         meta["moved_at_the_start"] = model.assembly.separated
+    if live is not None:
+        meta["live"] = live
     return RunWriter.create(folder, model.scene.model_dump_json(), topology, meta, overwrite=overwrite)
 
 
@@ -314,8 +360,7 @@ def running(
     if checkpoint is not None:
         _go_on_from(checkpoint, simulation, writer)
     else:
-        ignoring = simulation.work.quarantine.names(simulation.state.quarantined)
-        writer.append(0, 0.0, simulation.positions, {"quarantined": ignoring} if ignoring else {})
+        writer.append(0, 0.0, simulation.positions, _ignoring(simulation))
         writer.checkpoint(0, simulation.state.arrays())
     motions = 0
 

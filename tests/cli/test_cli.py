@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import tomllib
 import types
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 
 from pdipc.cli import app, metres
 from pdipc.output.results import RunWriter, open_run
+from pdipc.scene.load import bundled_scenes
 from tests.output import runs
 
 runner = CliRunner()
@@ -337,6 +339,23 @@ def test_the_schema_is_that_of_scenes(tmp_path):
     out = runner.invoke(app, ["schema", "-o", str(tmp_path / "s.json")])
     assert "#:schema" in out.stdout
     assert json.loads((tmp_path / "s.json").read_text()) == printed
+
+
+def test_an_editor_takes_what_loading_takes(tmp_path):
+    """By a validator of its own: all bundled scenes and that of `pdipc new` are right, and slips that loading refuses are found."""
+    jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema (extra: dev)")
+    schema = json.loads(runner.invoke(app, ["schema"]).stdout)
+    editor = jsonschema.Draft202012Validator(schema)
+    editor.check_schema(schema)
+    assert runner.invoke(app, ["new", str(tmp_path / "new.toml")]).exit_code == 0
+    for path in (*bundled_scenes().values(), tmp_path / "new.toml"):
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        assert editor.is_valid(tables), path
+    for key, value in (("materal", {}), ("kind", "clth"), ("material", {"poisson_ratio": 2}), ("mesh", {"shape": "cub"})):
+        slip = {"bodies": [{"name": "a", "kind": "cloth", "mesh": {"shape": "grid"}}]}
+        assert editor.is_valid(slip)
+        slip["bodies"][0][key] = value
+        assert not editor.is_valid(slip), key
 
 
 def test_figures_are_listed():

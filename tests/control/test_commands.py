@@ -258,6 +258,67 @@ def test_the_page_on_commands_runs_as_it_stands():
         exec(compile(block, "control.md", "exec"), {})
 
 
+def paddle():
+    sheet = cloth("sheet", (0.2, 0.2), (3, 3), at=(0.0, 0.02, 0.0))
+    made = scene([sheet], [box("paddle", [0.3, 0.02, 0.3], (0, 0, 0))], contact=CONTACT)
+    made.simulation.steps = 4
+    return made
+
+
+def test_a_recording_without_commands_is_the_run_of_its_scene(tmp_path):
+    pdipc.run_scene(paddle(), tmp_path / "run", device="cpu")
+    simulation = pdipc.Simulation(paddle(), "cpu")
+    with simulation.record(tmp_path / "recorded"):
+        for _ in range(4):
+            assert simulation.step().forces is not None
+    simulation.step()  # of which nothing is written
+    run, recorded = pdipc.open_run(tmp_path / "run"), pdipc.open_run(tmp_path / "recorded")
+    assert recorded.frame_count == run.frame_count == 5 and recorded.scene == run.scene
+    assert "live" in recorded.meta and "live" not in run.meta
+    for frame in range(5):
+        assert np.array_equal(run.positions(frame), recorded.positions(frame))
+    assert np.array_equal(run.forces(4).on("sheet").normal, recorded.forces(4).on("sheet").normal)
+    (mine,), (its,) = (sorted((each.folder / "checkpoints").iterdir())[-1:] for each in (recorded, run))
+    assert mine.read_bytes() == its.read_bytes()
+
+
+def test_what_commands_did_is_recorded(tmp_path):
+    simulation = pdipc.Simulation(paddle(), "cpu")
+    simulation.set_pose("paddle", (0, 0.04, 0))
+    with simulation.record(tmp_path / "run"):
+        seen = [simulation.positions]
+        for _ in range(4):
+            simulation.step()
+            seen.append(simulation.positions)
+    run = pdipc.open_run(tmp_path / "run")
+    assert seen[-1][16:, 1].min() > seen[0][16:, 1].min() + 0.03  # the paddle has gone up,
+    for frame, positions in enumerate(seen):  # and so it is written
+        assert run.positions(frame) == pytest.approx(positions, abs=1e-7)
+        assert not len(pdipc.find_intersections(run.positions(frame), run.triangles, run.obstacle))
+
+
+def test_a_recording_has_one_way(tmp_path):
+    """It begins at the start, and a step that does not follow the last one is refused before it is taken."""
+    simulation = pdipc.Simulation(paddle(), "cpu")
+    simulation.step()
+    with pytest.raises(pdipc.RunError, match="begins at the start, and 1 steps are done; reset first"):
+        simulation.record(tmp_path / "late").__enter__()
+    assert not (tmp_path / "late").exists()
+    simulation.reset()
+    with simulation.record(tmp_path / "run"):
+        with pytest.raises(pdipc.RunError, match=r"run is being recorded"):
+            simulation.record(tmp_path / "second").__enter__()
+        simulation.step()
+        simulation.reset()
+        with pytest.raises(pdipc.RunError, match="up to step 1; step 1 cannot follow"):
+            simulation.step()
+    assert simulation.steps_done == 0 and pdipc.open_run(tmp_path / "run").frame_count == 2
+    with pytest.raises(pdipc.RunError, match="holds a run already"):
+        simulation.record(tmp_path / "run").__enter__()
+    with simulation.record(tmp_path / "run", overwrite=True):
+        simulation.step()
+
+
 def test_a_reset_and_an_earlier_state_take_commands_back():
     """What a command led goes back to its script, also where that never moves it; it went on to where it had been told to go."""
     scene = pdipc.Scene(

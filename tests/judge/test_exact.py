@@ -30,3 +30,11 @@ def test_what_comes_nearer(kind, time, apart):
     end[first, 1] -= 2 * GAP
     assert stays_apart_exactly(np.concatenate([start, end]), kind, time) is apart
     assert stays_apart_exactly(np.concatenate([start, end]), kind, 0.5 + 1e-12) is not True  # it may be undecided
+
+
+@pytest.mark.parametrize(("separation", "apart"), [(0.5e-3, True), (2e-3, False)])
+def test_what_passes_over_between_the_moments_that_are_looked_at_first(separation, apart):
+    """A vertex flies over a small triangle, 1 mm above it at three tenths of the way."""
+    triangle = [[0, 0, -0.01], [0.01, 0, 0.01], [-0.01, 0, 0.01]]
+    points = np.array([[-0.3, 1e-3, 0], *triangle, [0.7, 1e-3, 0], *triangle])
+    assert stays_apart_exactly(points, "vertex_triangle", 1.0, separation) is apart

@@ -86,6 +86,19 @@ def test_what_is_hinged_turns_about_its_hinge(young):
     assert extents == pytest.approx(0.2, rel=1e-2)
 
 
+def test_a_stiff_body_under_a_fast_plate_keeps_its_shape(monkeypatch):
+    """Truncation cuts its vertices unevenly, and what the plate pushes need not lose energy: once that stretched a body of 80 GPa for good."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import converge
+
+    drawn = converge.draw(5131)
+    drawn.simulation.precision = "float64"
+    simulation = pdipc.Simulation(drawn, "cpu")
+    results = [simulation.step() for _ in range(11)]
+    assert all(result.converged for result in results), [result.message for result in results if not result.converged]
+    assert max(result.outer for result in results) <= 200
+
+
 @pytest.mark.parametrize("speed", [1.0, 8.0])
 def test_a_plate_pushes_what_is_in_its_way(speed):
     """By ten times d_hat a step and by eighty: the iterations of a step do not count how often d_hat fits into its way."""

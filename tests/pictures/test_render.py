@@ -42,8 +42,8 @@ def drawn(run, frame: int = 0, **settings) -> np.ndarray:
         return drawing.image(frame)
 
 
-def box(folder, gap: float = 0.5, walls: bool = True, height: float = 0.0):
-    """A run of one frame: a small ball between plates of a box, or a square of cloth above a floor."""
+def box(folder, gap: float = 0.5, walls: bool = True, height: float = 0.0, width: float = 1.0):
+    """A run of one frame: a small ball between plates of a box, or a strip of cloth, 1 m long, above a floor."""
     from pdipc.scene import generators
 
     names, kinds, meshes, places = ["ball"], ["solid"], [generators.Sphere(radius=0.2, cells=4).mesh()], [np.zeros(3)]
@@ -57,7 +57,7 @@ def box(folder, gap: float = 0.5, walls: bool = True, height: float = 0.0):
             places.append(place)
     if not walls:
         names, kinds = ["cloth", "floor"], ["cloth", "obstacle"]
-        meshes = [generators.Grid(size=(1.0, 1.0), cells=(2, 2)).mesh(), generators.Plane(size=40.0).mesh()]
+        meshes = [generators.Grid(size=(1.0, width), cells=(2, 2)).mesh(), generators.Plane(size=40.0).mesh()]
         places = [np.array([0.0, height, 0.0]), np.zeros(3)]
     first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     positions = np.concatenate([mesh.vertices + place for mesh, place in zip(meshes, places, strict=True)])
@@ -123,6 +123,17 @@ def test_bodies_have_the_looks_that_they_are_given(run):
     assert clear[0, 0, 3] == 0 and clear[50, 80, 3] == 255
 
 
+def test_glass_covers_a_transparent_background_in_part(run):
+    """Over any colour the picture is what it would be with that colour behind it, also at the edges of bodies."""
+    run.scene["bodies"][1]["look"] = {"opacity": 0.4}
+    look = {"shadows": False, "ground": "none"}
+    clear, grey = drawn(run, background="transparent", **look).astype(float), drawn(run, background="#808080", **look)
+    part = clear[..., 3:] / 255.0
+    assert {0.0, 0.4, 1.0} <= set(np.unique(part.round(2)))
+    over = part * clear[..., :3] + (1.0 - part) * 128.0
+    assert np.abs(over - grey).max() < 4.0
+
+
 def test_obstacles_that_hide_bodies_let_them_be_seen(tmp_path):
     run = box(tmp_path / "run")
     assert not share(drawn(run, obstacles="solid"), BLUE).any()
@@ -160,6 +171,22 @@ def test_shadows_are_softer_the_further_away_what_throws_them(tmp_path):
         assert middle == pytest.approx(0.5 + shift[0], abs=0.06)
     assert widths[1] == pytest.approx(2 * widths[0], rel=0.35)
     assert 0.5 * LAMP_SIZE * 0.5 < widths[1] < 3 * LAMP_SIZE * 0.5 / rendering.LAMP[1]
+
+
+def test_what_is_thin_and_far_away_throws_next_to_no_shadow(tmp_path):
+    """A strip takes of the lamp, which looks 2 LAMP_SIZE s wide from a distance s, no more than its own width."""
+    from pdipc.pictures.shading import LAMP_SIZE
+
+    width, height = 0.006, 0.5
+    camera = {"position": (0.0, 6.0, 1e-3), "target": (0.0, 0.0, 0.0), "size": (400, 400), "zoom": 2.0}
+    run = box(tmp_path / "run", walls=False, height=height, width=width)
+    picture = drawn(run, obstacles="solid", **camera).astype(float).mean(axis=2)
+    pixel = 2 * 6.0 * np.tan(np.radians(rendering.ANGLE / 2)) / 400 / 2.0  # m on the floor
+    middle = 200 - rendering.LAMP[2] * height / rendering.LAMP[1] / pixel
+    across = round(0.15 / pixel)
+    rows = picture[round(middle) - across : round(middle) + across, 180:220]
+    hidden = 4 / np.pi * width / (2 * LAMP_SIZE * height)  # of a disc by a strip through its middle
+    assert 0.2 * hidden < 1.0 - rows.min() / rows.max() < 2 * hidden
 
 
 def test_pressure_is_shown_on_what_is_pressed(run):

@@ -13,6 +13,7 @@ import pdipc
 from pdipc.scene import save, schema
 from pdipc.scene.assembly import assemble
 from pdipc.scene.check import check
+from pdipc.scene.generators import Grid
 from pdipc.scene.load import bundled_scenes, load_scene
 from tests.physics.scenes import cloth, floor, solid
 
@@ -26,6 +27,56 @@ def test_bundled_scenes(name, tmp_path):
     scene = load_scene(name)
     scene.save(tmp_path / "saved.toml")
     assert same(load_scene(tmp_path / "saved.toml"), scene)
+
+
+def everything() -> pdipc.Scene:
+    """Each kind of body, mesh, motion, pin, link, force and world that a scene may have."""
+    sheet = Grid(size=(1.0, 1.0), cells=(3, 3)).mesh()
+    corners, triangles = sheet.vertices, sheet.triangles
+    arrays = {"vertices": corners, "triangles": triangles}
+    turn = {"keyframes": [{"time": 0.0}, {"time": 1.0, "rotation": [0, 270, 0]}], "smooth": True, "turns": "shortest"}
+    pins = [
+        {"select": {"nearest": [0, 3, 0]}, "motion": turn},
+        {"select": {"box": [[-1, 2, -1], [0, 4, 1]]}, "axes": "yz", "stiffness": 30.0, "start": 0.1, "end": 0.2},
+        {"select": {"sphere": [[0, 3, 0], 0.1]}, "follow": "hand", "end": 0.5},
+    ]
+    box, woven = {"shape": "box", "size": [0.1] * 3}, {"warp": [1, 0, 0], "weft_stiffness": 50.0, "strain_limit": 1.05}
+    rest = {"scale": 0.5, "mesh": arrays}
+    cache = {"vertices": np.stack([corners, corners / 3]), "times": [0.0, 0.3]}
+    return pdipc.Scene(
+        title='a "quoted" title',
+        simulation={"precision": "float64", "budget_ms": 4.5},
+        contact={"start": "separate", "quarantine": [["soft", "ring"]]},
+        bodies=[
+            {"name": "soft", "kind": "solid", "mesh": box, "copies": {"counts": [2, 1, 1]}, "look": {"color": "red"}},
+            {"name": "ring", "kind": "rigid", "mesh": {"shape": "torus"}, "angular_velocity": [1, 0, 0]},
+            {"name": "rope", "kind": "rod", "mesh": {"shape": "rope", "length": 0.5}, "material": {"radius": 2e-3}},
+            {"name": "my sheet", "kind": "cloth", "mesh": {"shape": "grid"}, "material": woven, "pins": pins},
+            {"name": "ball", "kind": "cloth", "mesh": {"shape": "sphere"}, "inside": {"gas": 101325.0}},
+            {"name": "cut", "kind": "cloth", "mesh": {**arrays, "start": corners + 1.0}, "rest": rest, "weld": 1e-6},
+        ],
+        obstacles=[
+            {"name": "hand", "mesh": box, "motion": {"angular_velocity": [0, 1, 0], "center": [0, 3, 0], "end": 1.0}},
+            {"name": "ground", "mesh": arrays, "motion": {"cache": cache}},
+            {"name": "tank", "mesh": box, "scale": [9, 8, 7], "inward": True},
+        ],
+        attachments=[{"bodies": ["rope", "my sheet"], "pairs": [[0, 1], [2, 3]], "rest_length": 0.1}],
+        stitches=[{"bodies": ["my sheet", "cut"], "points": [[0, [1, 2], [0.25, 0.75]]], "duration": 0.5}],
+        forces=[
+            {"kind": "wind", "velocity": [1, 0, 0], "bodies": ["cut"], "start": 0.1},
+            {"kind": "vertices", "body": "soft", "select": {"all": True}, "force": [0, 1, 0], "end": 2.0},
+        ],
+        picture={"view": [1, 0.2, 1], "color": "pressure", "top": 1e3},
+        worlds=[{"contact.friction": 0.1, 'bodies."my sheet".material.strain_limit': 1.1}, {}],
+    )
+
+
+def test_all_that_a_scene_may_have(tmp_path):
+    scene = everything()
+    scene.save(tmp_path / "saved.toml")
+    assert same(load_scene(tmp_path / "saved.toml"), scene)
+    given = {name for name in schema.Scene.model_fields if getattr(scene, name) != schema.Scene.model_fields[name].default}
+    assert given == set(schema.Scene.model_fields) - {"description"}, "this test is to hold every table"
 
 
 def test_what_was_changed_since_and_nothing_else(tmp_path):

@@ -97,6 +97,13 @@ def test_copies_share_the_place_and_do_not_meet():
     np.testing.assert_array_equal(worlds.positions[1], begun[1]["positions"])
 
 
+def test_a_key_that_is_none_is_refused_where_the_scene_is_made():
+    """It was written by `save` as it is, into a file that does not load."""
+    made = pushed()
+    with pytest.raises(pdipc.SceneError, match=r'"bodies\.my cube\.friction": is no key; .* bodies\."a b"\.friction'):
+        pdipc.Scene(bodies=made.bodies, worlds=[{"bodies.my cube.friction": 0.1}])
+
+
 def test_where_one_raises_the_others_make_their_step():
     worlds = pdipc.Worlds(pushed(), 3, device="cpu")
     worlds.step()

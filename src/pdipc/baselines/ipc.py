@@ -46,7 +46,6 @@ class Problem:
         self.number = np.full(n, -1)
         self.number[self.free] = np.arange(len(self.free))
         self.free_dofs = (3 * self.free[:, None] + np.arange(3)).ravel()
-        self.held_dofs = (3 * np.flatnonzero(self.kinematic)[:, None] + np.arange(3)).ravel()
         own = np.arange(n)[:, None]
         self.pattern = BlockPattern([own, *(term.vertices for term in self.terms)], self.number)
         inertia = np.zeros((n, 1, 3, 1, 3))

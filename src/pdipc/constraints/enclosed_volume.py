@@ -186,7 +186,7 @@ class Cavities:
         """Launches W'' and dV/dx at x = base + u, what `apply` multiplies with."""
         self.measure(base, u)
         self.device.copy(self.stiffness, self._stiffness)
-        inputs = [self._members, self._starts, self._around, self.vertices, base, u, self._gradient]
+        inputs = [self._starts, self._around, self.vertices, base, u, self._gradient]
         self.device.launch(self._kernels.gather_gradient, self._count, inputs, grain=32)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
@@ -322,7 +322,6 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def gather_gradient(
         first: int,
-        members: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         around: wp.array(dtype=wp.int32),
         vertices: wp.array(dtype=wp.vec3i),

@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from pdipc.device.language import filled, kernel, struct_of
@@ -595,6 +594,8 @@ def returned(mover: Mover, path: Trajectory, stopped: float, now: float, h: floa
     `stopped`. What came before was looked at in the steps before.
     """
     turn, place = path.pose(stopped)
+    from scipy.optimize import minimize_scalar  # a tenth of what the first step waits for, and seldom needed
+
     reach = mover.reach(path)
 
     def away(time: float) -> float:

@@ -41,7 +41,6 @@ def history(real: Real) -> Any:
         gram=wp.array(dtype=square),  # df_i . df_j
         theta=wp.array(dtype=small),
         norms=wp.array(dtype=wp.float64),  # (2,) |f|^2 of the last increment; largest |f| of the first
-        moved=wp.array(dtype=real.scalar),  # m, largest |f| of the last
         fresh=wp.array(dtype=wp.int32),  # whether none was seen in this loop
         known=wp.array(dtype=wp.int32),  # increments seen since the history was last dropped
         left=wp.array(dtype=wp.int32),  # iterations
@@ -124,7 +123,6 @@ def kernels(real: Real) -> SimpleNamespace:
             o.norms[1] = moved
         o.done[0] = o.done[0] + 1
         o.left[0] = o.left[0] - 1
-        o.moved[0] = scalar(moved)
         theta = small()
         stop = o.left[0] <= 0 or not (moved > wp.float64(tolerance)) or moved <= wp.float64(relative_tolerance) * o.norms[1]
         if seen > 0:
@@ -193,7 +191,6 @@ class Anderson:
     """The loop of local-global iterations and its acceleration; everything stays on the device and is recordable.
 
     going: (1,) int32, nonzero while the loop goes on. done: (1,) int32, iterations since the caller last set it to zero.
-    moved: (1,) m, the largest motion of a vertex in the last iteration's increment.
 
     The loop ends at its cap of iterations, or once no vertex moves by more than `tolerance` (m), or by more than
     `relative_tolerance` of what it moved in the first iteration.
@@ -211,7 +208,7 @@ class Anderson:
         self.df, self.dg = zeros(real.vec3, (MEMORY, count)), zeros(real.vec3, (MEMORY, count))
         self.partial = zeros(sums, self.blocks)
         self.gram, self.theta = zeros(square), zeros(small)
-        self.norms, self.moved = zeros(wp.float64, 2), zeros(real.scalar)
+        self.norms = zeros(wp.float64, 2)
         self.fresh, self.known, self.left, self.done, self.going = (zeros(wp.int32) for _ in range(5))
         self.history = filled(history(real), self)
 

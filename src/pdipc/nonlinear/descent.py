@@ -31,6 +31,7 @@ from pdipc.integration import inertia as implicit
 from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL, led
 
+FIERCE = 10.0  # times its potential: where what is driven raises it by more, truncation has cut the step unevenly, and it is made even first
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -225,6 +226,8 @@ def kernels(real: Real) -> SimpleNamespace:
             island = islands.label[b]
             ok = search.accepted[island]
             unseen = slack * wp.abs(e.before[island]) + negligible
+            if e.after[island] > wide(FIERCE) * wp.abs(e.before[island]) + unseen and search.attempts[0] == 0:
+                ok = 0
             if e.after[island] <= e.before[island] + unseen or search.attempts[0] > HALVINGS:
                 ok = 1
             if e.after[island] < e.before[island] - unseen:

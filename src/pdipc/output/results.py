@@ -158,6 +158,12 @@ class RunWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def expects(self, step: int) -> None:
+        """Raises RunError where `step` does not follow the last frame."""
+        if self.frames and step != self.frames[-1][0] + 1:
+            last = self.frames[-1][0]
+            raise RunError(f"{self.folder} has frames up to step {last}; step {step} cannot follow: a run has one way")
+
     def append(
         self,
         step: int,

@@ -11,7 +11,7 @@ from pdipc.device.launch import Device, Reducer
 from pdipc.device.precision import Real
 from pdipc.paper_mode.targets import INNER_RATE, PaperPairs
 
-MOMENTUM, ELASTIC, BARRIER, TOTAL, MOVED = (wp.constant(slot) for slot in range(5))  # places of `energies`
+MOMENTUM, ELASTIC, BARRIER, TOTAL = (wp.constant(slot) for slot in range(4))  # places of `energies`
 
 
 @functools.cache
@@ -40,14 +40,12 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         h: scalar,
         x_tilde: wp.array(dtype=vec3),
-        moved_out: wp.array(dtype=scalar),
         momentum_out: wp.array(dtype=scalar),
     ):
         """x~ moves; and the momentum potential (line 8, with M^(1/2) as in Eq. 1)."""
         i = first + wp.tid()
         x = x_tilde[i] + free[i] * increment[i]
         x_tilde[i] = x
-        moved_out[i] = free[i] * wp.length(increment[i])
         momentum_out[i] = scalar(0.5) * mass[i] / (h * h) * wp.length_sq(x - z[i])
 
     @kernel(module)
@@ -57,14 +55,12 @@ def kernels(real: Real) -> SimpleNamespace:
         energies: wp.array(dtype=scalar),
         left: wp.array(dtype=wp.int32),
         done: wp.array(dtype=wp.int32),
-        moved_out: wp.array(dtype=scalar),
         going_out: wp.array(dtype=wp.int32),
     ):
         """Line 11: dE = |change of E + Psi + B| / (E + Psi + B)."""
         total = energies[MOMENTUM] + energies[ELASTIC] + energies[BARRIER]
         change = wp.abs(total - energies[TOTAL])
         energies[TOTAL] = total
-        moved_out[0] = energies[MOVED]
         done[0] = done[0] + 1
         left[0] = left[0] - 1
         # a comparison with NaN is false, which ends the loop
@@ -79,7 +75,7 @@ class EnergyRate:
 
     base, x, z: (n,) m, buffers of the step: where it starts, and as displacements from there where the outer iteration starts, and the
     inertial target.
-    energies: (5,) on the device, of the last iterate: E, Psi, B and their sum, J; and its largest motion, m.
+    energies: (4,) on the device, of the last iterate: E, Psi, B and their sum, J.
     """
 
     def __init__(
@@ -97,9 +93,7 @@ class EnergyRate:
         self.device, self.real, self.kernels = device, real, kernels(real)
         self.projector, self.pairs, self.base, self.x, self.z, self.mass = projector, pairs, base, x, z, mass
         self.per_vertex, self.reducer = wp.zeros(n, dtype=real.scalar, device=device.warp), Reducer(device, real, n)
-        self.lengths = wp.zeros(n, dtype=real.scalar, device=device.warp)
-        self.energies = wp.zeros(5, dtype=real.scalar, device=device.warp)
-        self.moved = wp.zeros(1, dtype=real.scalar, device=device.warp)
+        self.energies = wp.zeros(4, dtype=real.scalar, device=device.warp)
         self.left, self.done, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
 
     def begin(self, iterations: int) -> None:
@@ -109,12 +103,11 @@ class EnergyRate:
     def advance(self, x_tilde: wp.array, increment: wp.array, free: wp.array) -> None:
         """Launches the update of x~ by the global step's increment, and the decision whether to go on."""
         k, device, n = self.kernels, self.device, len(self.mass)
-        inputs = [increment, self.z, self.mass, free, self.pairs.h, x_tilde, self.lengths, self.per_vertex]
+        inputs = [increment, self.z, self.mass, free, self.pairs.h, x_tilde, self.per_vertex]
         device.launch(k.move, n, inputs)
         self.reducer.sum(self.per_vertex, self.energies, MOMENTUM)
-        self.reducer.max(self.lengths, self.energies, MOVED)
         self.projector.energy(self.base, x_tilde, self.energies, ELASTIC)
         self.pairs.vertex_energy(self.x, x_tilde, self.per_vertex)
         self.reducer.sum(self.per_vertex, self.energies, BARRIER)
-        counters = [self.left, self.done, self.moved, self.going]
+        counters = [self.left, self.done, self.going]
         device.launch_serial(k.decide, [self.real.scalar(INNER_RATE), self.energies, *counters])

@@ -221,7 +221,9 @@ class Drawing:
         composed = shading.compose(
             self.device, everywhere, lamp, depth, self._camera(), seen, to_lamp, LAMP, radius, OVERSAMPLED
         )
-        picture = composed[::-1] if self.settings.background == "transparent" else composed[::-1, :, :3]
+        picture = composed[::-1]
+        if self.settings.background == "transparent":
+            picture = _over_nothing(picture, everywhere[::-1], self._shot(lamp=False, behind="white")[0][::-1])
         if self.field is None:
             return np.ascontiguousarray(picture)
         bar = legend.draw(self.field.title, self.field.unit, self.field.top, COLORS, (self.beside, self.size[1]))
@@ -358,8 +360,10 @@ class Drawing:
         far = max(1.01 * float(away.max()), 1e-3 * self.radius)
         camera.clipping_range = (max(0.99 * float(away.min()), 1e-3 * far), far)
 
-    def _shot(self, lamp: bool | None) -> tuple[np.ndarray, np.ndarray]:
-        """(h, w, 3) uint8 and (h, w) float32: what the camera sees in the lamp's light alone, or in all other; None: flat numbers."""
+    def _shot(self, lamp: bool | None, behind: str = "black") -> tuple[np.ndarray, np.ndarray]:
+        """(h, w, 3) uint8 and (h, w) float32: what the camera sees in the lamp's light alone, or in all other; None: flat numbers.
+        behind: the colour where nothing is, in place of a transparent background.
+        """
         everywhere, lamp_light = self._lights
         for light in everywhere:
             light.on = not lamp
@@ -369,7 +373,7 @@ class Drawing:
                 body.light(lamp)
         background = self.settings.background
         dark = lamp or lamp is None or background == "transparent"
-        self.plotter.set_background("black" if dark else background)
+        self.plotter.set_background(behind if dark else background)
         return self._render()
 
     def _render(self, part: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -650,6 +654,21 @@ def _pressed(run: Run, positions: np.ndarray, values: np.ndarray, reach: float) 
 def _sampled(count: int, most: int) -> np.ndarray:
     """At most so many of 0 to count - 1, the first and the last among them."""
     return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+
+
+def _over_nothing(picture: np.ndarray, on_black: np.ndarray, on_white: np.ndarray) -> np.ndarray:
+    """(h, w, 4) uint8: a picture (h, w, 3) that was drawn over black, with how much it covers as its fourth channel; glass covers in part.
+
+    on_black, on_white: the same unlit by the lamp, over black and over white, OVERSAMPLED times as fine: where both are alike nothing
+    shows through.
+    """
+    through = np.subtract(on_white, on_black, dtype=np.int16, casting="unsafe").clip(0).mean(axis=2)
+    h, w = picture.shape[:2]
+    covered = 255.0 - through.reshape(h, OVERSAMPLED, w, OVERSAMPLED).mean(axis=(1, 3))
+    whole = (
+        picture * (255.0 / np.maximum(covered, 0.5))[..., None]
+    )  # files hold colours as they would be if nothing showed through
+    return np.concatenate([whole.clip(0, 255), covered[..., None]], axis=2).round().astype(np.uint8)
 
 
 def _projection(camera: Any, size: tuple[int, int]) -> np.ndarray:

@@ -73,7 +73,7 @@ def compose(
     radius: float,
     oversampled: int,
 ) -> np.ndarray:
-    """(h, w, 4) uint8: the picture, its rows from below; the last channel is how much of a pixel is covered, of 255.
+    """(h, w, 3) uint8: the picture, its rows from below.
 
     oversampled: f, drawn pixels per pixel along each side. everywhere, lamp: (f h, f w, 3) uint8, the two parts of the light. depth:
     (f h, f w) float32, 1 where nothing is. seen_by_lamp:
@@ -81,7 +81,7 @@ def compose(
     radius: m, of what shades by its nearness; 0 for no such shade.
     """
     height, width = (side // oversampled for side in depth.shape)
-    out = wp.zeros((height * width, 4), dtype=wp.uint8, device="cpu")
+    out = wp.zeros((height * width, 3), dtype=wp.uint8, device="cpu")
     view, light = _View(), _Lamp()
     view.depth = _array(depth, wp.float32)
     view.near, view.far = camera.near, camera.far
@@ -100,7 +100,7 @@ def compose(
         device.launch(kernels().shade, coarse.size, [step, view, coarse], grain=100)
     inputs = [oversampled, width, _array(everywhere, wp.uint8), _array(lamp, wp.uint8), view, light, coarse, out]
     device.launch(kernels().compose, height * width, inputs, grain=100)
-    return out.numpy().reshape(height, width, 4)
+    return out.numpy().reshape(height, width, 3)
 
 
 def _array(values: np.ndarray, dtype: type) -> Any:
@@ -188,8 +188,17 @@ def kernels() -> SimpleNamespace:
                 if reached(lamp, i, j, at, steep) == 0.0:
                     blockers += 1.0
                     depths += lamp.seen[j, i]
+        if blockers == 0.0:  # what is thinner than samples are apart may yet be in the way
+            i0 = int(wp.floor(at[0] * float(lamp.seen.shape[1]) - 0.5))
+            j0 = int(wp.floor(at[1] * float(lamp.seen.shape[0]) - 0.5))
+            for k in range(4):
+                i, j = i0 + k % 2, j0 + k // 2
+                if i >= 0 and j >= 0 and i < lamp.seen.shape[1] and j < lamp.seen.shape[0]:  # noqa: SIM102 (Warp looks at both)
+                    if reached(lamp, i, j, at, steep) == 0.0:
+                        blockers += 1.0
+                        depths += lamp.seen[j, i]
         if blockers == 0.0:
-            return lit(lamp, at[0], at[1], at, steep)
+            return 1.0
         wide = LAMP_SIZE * (at[2] - depths / blockers) * deep
         wide = wp.max(wide, 1.5 * across[0] / float(lamp.seen.shape[1]))
         total = float(0.0)
@@ -307,6 +316,5 @@ def kernels() -> SimpleNamespace:
         share = 1.0 / float(factor * factor)
         for c in range(3):
             out[i, c] = wp.uint8(color[c] * share + 0.5)
-        out[i, 3] = wp.uint8(255.0 * cover * share + 0.5)
 
     return SimpleNamespace(shade=shade, compose=compose)

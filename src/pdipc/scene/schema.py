@@ -29,7 +29,7 @@ from pdipc.scene.explain import short
 from pdipc.scene.garments import Inside
 from pdipc.scene.looks import Look, Picture
 from pdipc.scene.tables import Index, NotNegative, Number, Positive, Real, Table, Vector, Whole
-from pdipc.scene.vary import flat
+from pdipc.scene.vary import flat, split_key
 
 SHORTEST_STEP = 1e-9  # s
 MOST_WORLDS = 10_000
@@ -913,6 +913,8 @@ def _some_worlds(worlds: Any) -> Any:
     elif isinstance(worlds, list | tuple) and all(isinstance(changes, dict) for changes in worlds):
         worlds = [flat(changes) for changes in worlds]
         count = len(worlds)
+        for key in {str(key) for changes in worlds for key in changes}:
+            split_key(key)
     else:
         raise ValueError("must be a number of copies, or a list of tables with what is other in each world")
     if not 1 <= count <= MOST_WORLDS:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pdipc.audit import audit
 from pdipc.output.results import RunWriter
-from pdipc.simulation import Simulation, stats_of
+from pdipc.simulation import Simulation, stats_of, writer_of
 
 KEPT = 1 << 29  # bytes of frames that are kept; then the oldest go
 IDLE = 0.02  # s between two looks at what the page asked for
@@ -134,15 +134,7 @@ class Engine:
         """
         if self.frames[0].step != 0:
             raise ValueError("the first frames are not kept any more; reset, then record")
-        model = self.simulation.model
-        meta = {
-            "device": model.device.name,
-            "precision": model.real.name,
-            "threads": model.device.threads,
-            "live": "pulled by hand",
-        }
-        topology = {"triangles": model.triangles, **model.assembly.topology()}
-        self._writer = RunWriter.create(folder, model.scene.model_dump_json(), topology, meta)
+        self._writer = writer_of(self.simulation, folder, None, live="pulled by hand")
         for shot in self.frames:
             self._write(shot)
 
