@@ -11,7 +11,7 @@ pytest.importorskip("pyvista", reason="needs pyvista (extra: pictures)")
 
 from pdipc.device.launch import Device
 from pdipc.output.results import open_run
-from pdipc.reproduce import _common, _snapshots, fig9, fig10, fig12, fig13
+from pdipc.reproduce import _beside_ipc, _common, _scenes, _snapshots, fig9, fig10, fig11_ipc, fig12, fig13
 from pdipc.scene import meshes
 from pdipc.scene.load import load_scene
 
@@ -101,6 +101,54 @@ def test_fig12(tmp_path, capsys):
     size = np.linalg.norm(np.ptp(x[~ours.scripted], axis=0))
     np.testing.assert_allclose(x[ours.scripted], y[ours.scripted], atol=1e-9)
     assert np.linalg.norm(x - y, axis=1).mean() < 3e-3 * size
+
+
+@pytest.fixture
+def colliding(monkeypatch):
+    """Two helicopters of few elements that meet in the second of two steps."""
+
+    def scene(name, cells):
+        data = load_scene(name).model_dump()
+        data["simulation"]["steps"] = 2
+        data["bodies"] = data["bodies"][:2]
+        for body, x in zip(data["bodies"], (-0.36, 0.36), strict=True):
+            body["mesh"]["cells"] = 10
+            body["translation"] = (x, *body["translation"][1:])
+        return type(load_scene(name)).model_validate(data)
+
+    monkeypatch.setattr(_scenes, "refined", scene)
+    monkeypatch.setattr(_snapshots, "PANEL", (160, 120))
+    return scene("rubber_helicopters", {})
+
+
+def test_helicopters_beside_ipc(tmp_path, capsys, colliding):
+    """Both come to the same end, in contact, and none intersects; times are positive."""
+    pytest.importorskip("cholespy", reason="needs cholespy (extra: benchmarks)")
+    pytest.importorskip("ipctk", reason="needs ipctk (extra: benchmarks)")
+    check_files(fig11_ipc.run(tmp_path, small=True, device="cpu"), capsys.readouterr().out)
+    found = rows(tmp_path / "fig11_ipc.csv")
+    assert [int(row["step"]) for row in found] == [1, 2]
+    assert max(int(row["barriers"]) for row in found) > 0
+    for who in ("this package", "IPC"):
+        assert all(row[f"converged of {who}"] == "True" and float(row[f"seconds of {who}"]) > 0.0 for row in found)
+    assert float(found[-1]["mean distance, m"]) < 1e-5
+    assert "intersections 0 and 0" in (tmp_path / "fig11_ipc.txt").read_text()
+    again = _beside_ipc.single_steps(_beside_ipc.with_arap(colliding), open_run(tmp_path / "ours"), [2], tmp_path / "again")
+    apart = np.linalg.norm(again.positions(-1) - open_run(tmp_path / "ours").positions(2), axis=1)
+    assert apart.mean() < 1e-5  # the second step, from where ours starts it
+
+
+def test_a_log_is_told_of_progress():
+    """A line each minute and one at the end, with what is left at the rate so far; a run that goes on began at what it had."""
+    lines, now = [], [0.0]
+    advance = _common.lines_of_progress("row", 20, lines.append, lambda: now[0])
+    for done in range(11, 21):
+        now[0] += 30.0
+        advance(done, f"contacts {done}")
+    assert lines == [
+        f"row: {done}/20 contacts {done}, {left} left"
+        for done, left in zip((12, 14, 16, 18, 20), ("0:04:00", "0:03:00", "0:02:00", "0:01:00", "0:00:00"), strict=True)
+    ]
 
 
 def test_snapshots(tmp_path, capsys, monkeypatch):

@@ -49,6 +49,7 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
     assert printed["order"] == "3" and int(printed["L-G"]) > 0
     assert default["steps"] == "2" and default["intersections"] == printed["intersections"] == "0"
     assert default["unconverged"] == "0"
+    assert float(default["processor ms"]) > 0.0 and 50 < int(default["memory, MiB"]) < 10_000
     assert float(printed["away from default, mm"]) > 0.0 and default["away from default, mm"] == ""
     assert "Here" in told.output and "every frame judged by the witness" in told.output.replace("\n", " ")
     written = json.loads((tmp_path / "table1.json").read_text())
@@ -66,7 +67,6 @@ def test_both_modes_and_going_on(tmp_path, monkeypatch):
         patched.setattr(_common, "intersections", not_again)
         patched.setattr(_common, "pictures", not_again)
         assert run(*options, "--steps", 2).exit_code == 0
-    monkeypatch.setattr(table1, "_picture", lambda *_: None)
     monkeypatch.setattr(table1, "_films", lambda *_: None)
     assert run("--rows", "dragon", "-o", tmp_path, "--steps", 3).exit_code == 0
     longer = open_run(tmp_path / "dragon-default")

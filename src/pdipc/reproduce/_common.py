@@ -1,12 +1,16 @@
 """What the figures share: optional data, runs that go on where they were stopped, pictures, the last sentence."""
 
 import csv
+import datetime
 import json
 import os
 import platform
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +20,10 @@ from pdipc.output.results import Run, RunWriter, open_run
 from pdipc.pictures.render import drawing, settings_of
 from pdipc.scene.assembly import assemble
 from pdipc.scene.schema import Scene
-from pdipc.simulation import run_scene
+from pdipc.simulation import StepInfo, run_scene
 
 CHECKOUT = Path(__file__).parents[3]
+EVERY = 60.0  # s, between the lines that a log is told
 Arrays = dict[str, np.ndarray]
 
 
@@ -31,13 +36,25 @@ def data(name: str) -> Path | None:
 # --- runs ---
 
 
-def simulated(scene: Scene, folder: Path, label: str, device: str | None = None, steps: int | None = None) -> Run:
+def simulated(
+    scene: Scene,
+    folder: Path,
+    label: str,
+    device: str | None = None,
+    steps: int | None = None,
+    after: Callable[[], Any] = lambda: None,
+) -> Run:
     """The run of `scene` in `folder`. One of the same scene that was stopped goes on; one that is complete is only read.
 
-    steps: in place of the scene's.
+    steps: in place of the scene's. after: called after each step that is made.
     """
     resume = _begun(scene, folder)
     with progress(label, scene.simulation.steps if steps is None else steps) as advance:
+
+        def made(info: StepInfo) -> None:
+            after()
+            advance(info.step, f"outer {info.result.outer:<3d} contacts {info.result.barriers}")
+
         run_scene(
             scene,
             folder,
@@ -45,15 +62,21 @@ def simulated(scene: Scene, folder: Path, label: str, device: str | None = None,
             device=device,
             resume=resume,
             overwrite=not resume,
-            progress=lambda info: advance(info.step, f"outer {info.result.outer:<3d} contacts {info.result.barriers}"),
+            progress=made,
         )
     return open_run(folder)
 
 
-def stepped(scene: Scene, folder: Path, label: str, step: Callable[[int, Arrays], tuple[Arrays, dict]]) -> Run:
+def stepped(
+    scene: Scene,
+    folder: Path,
+    label: str,
+    step: Callable[[int, Arrays], tuple[Arrays, dict]],
+    first: Arrays | None = None,
+) -> Run:
     """As `simulated`, but by another method: step(k, arrays) makes step k; it returns the new arrays and its statistics.
 
-    The arrays that it starts from are the scene's positions and velocities, (n, 3).
+    first: the arrays that it starts from; absent, the scene's positions and velocities, (n, 3).
     """
     if _begun(scene, folder):
         writer = RunWriter.resume(folder)
@@ -62,7 +85,7 @@ def stepped(scene: Scene, folder: Path, label: str, step: Callable[[int, Arrays]
         assembly = assemble(scene)
         topology = {"triangles": assembly.triangles, **assembly.topology()}
         writer = RunWriter.create(folder, scene.model_dump_json(), topology, {"device": "cpu"}, overwrite=True)
-        done, arrays = 0, {"positions": assembly.positions, "velocities": assembly.velocities}
+        done, arrays = 0, first or {"positions": assembly.positions, "velocities": assembly.velocities}
         writer.append(0, 0.0, assembly.positions, {})
         writer.checkpoint(0, arrays)
     with writer, progress(label, scene.simulation.steps) as advance:
@@ -91,14 +114,40 @@ def intersections(run: Run) -> list[int]:
 
 @contextmanager
 def progress(label: str, total: int) -> Iterator[Callable[[int, str], None]]:
-    """A bar on stderr; yields a function that takes how much is done, and what to say of it."""
+    """A bar on stderr, or where that is no terminal a line now and then; yields a function that takes how much is done, and what to
+    say of it.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lines_of_progress(label, total, lambda line: print(line, file=sys.stderr, flush=True))
+        return
     columns = [TextColumn(label), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[told]}")]
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+    with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task(label, total=total, told="")
         yield lambda done, told: bar.update(task, completed=done, told=told)
+
+
+def lines_of_progress(
+    label: str, total: int, write: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+) -> Callable[[int, str], None]:
+    """What a log is told: a line each minute, with the time that is left at the rate so far, and one at the end."""
+    begun, last, first = clock(), clock(), None
+
+    def advance(done: int, told: str) -> None:
+        nonlocal last, first
+        now = clock()
+        if first is None:
+            first = done  # a run that goes on has done the steps before
+        if done == total or now - last >= EVERY:
+            last = now
+            rate = (done - first + 1) / max(now - begun, 1e-9)
+            left = datetime.timedelta(seconds=round((total - done) / rate))
+            write(f"{label}: {done}/{total} {told}, {left} left".replace(" ,", ","))
+
+    return advance
 
 
 # --- what is written ---
@@ -124,16 +173,17 @@ def pictures(
 ) -> list[np.ndarray]:
     """The given frames, (height, width, 3) uint8 each, under one camera that holds all of `framed` (else of `frames`).
 
-    view: absent, that of the scene. beside: a run under whose camera, for the same frames, this one is drawn.
+    view: absent, that of the scene. beside: a run under whose camera, which holds all of `framed` of that run, this one is drawn.
     """
     frames = list(frames)
+    framed = list(frames if framed is None else framed)
     settings = settings_of(run).model_copy(update={"size": size} | ({"view": view} if view else {}))
     if beside is not None:
-        with drawing(beside, list(framed or frames), settings) as drawn:
+        with drawing(beside, framed, settings) as drawn:
             camera = drawn.plotter.camera
             place = {"position": tuple(camera.position), "target": tuple(camera.focal_point)}
-        settings = settings.model_copy(update=place)
-    with drawing(run, list(framed or frames), settings) as drawn:
+        settings, framed = settings.model_copy(update=place), frames
+    with drawing(run, framed, settings) as drawn:
         return [drawn.image(frame) for frame in frames]
 
 

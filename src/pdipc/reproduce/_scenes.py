@@ -337,8 +337,9 @@ def animal_crossing() -> Scene:
 
 
 def refined(name: str, cells: dict[str, int], cloth: dict[str, tuple[int, int]] | None = None) -> Scene:
-    """A bundled scene with finer figures, and cloths of more cells."""
+    """A bundled scene with finer figures, cloths of more cells, and the paper's activation distance."""
     data = _bundled(name)
+    data["contact"] |= CONTACT
     for body in data["bodies"]:
         if body["mesh"].get("shape") == "figure":
             body["mesh"]["cells"] = cells[body["mesh"]["name"]]

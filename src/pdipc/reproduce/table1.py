@@ -1,9 +1,11 @@
 """Table 1: the paper's eight scenes one after another, what each step takes, and the paper's numbers beside them."""
 
 import hashlib
+import itertools
 import json
 import math
 import statistics
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +20,22 @@ from pdipc.pictures.render import render_animation, settings_of
 from pdipc.reproduce import _common, _scenes
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.load import load_scene
+from pdipc.scene.memory import used_memory
 from pdipc.scene.schema import Cloth, Scene
 
 COLUMNS = ("bodies", "DOF", "elements", "triangles / edges", "constraints", "barriers", "order", "L-G", "outer", "linear")
 COLUMNS += ("solver ms", "CCD ms", "barrier ms", "misc ms", "FPS")
-JUDGED = ("steps", "unconverged", "intersections", "median ms", "p95 ms", "energy gained, J", "away from default, mm")
+JUDGED = (
+    "steps",
+    "unconverged",
+    "intersections",
+    "median ms",
+    "p95 ms",
+    "processor ms",
+    "memory, MiB",
+    "energy gained, J",
+    "away from default, mm",
+)
 MODES = ("default", "paper")
 Mode = Literal["default", "paper", "both"]
 SHOTS = (0.0, 0.3, 0.6, 1.0)  # of a run, in its picture
@@ -135,10 +148,13 @@ def run(
         known = [_known(out, name, each) for each in modes]
         judged = [_row(out, name, each, scene, steps, device) for each in modes]
         found += judged
-        if known != judged or not (out / f"{name}.png").is_file():
-            _picture(out, name, modes)
-            _films(out, name, modes)
+        if known != judged:
+            (out / f"{name}.png").unlink(missing_ok=True)
         _write(out, found, machine, small)
+    for name in chosen:  # after all runs, whose memory is told
+        if not (out / f"{name}.png").is_file():
+            _films(out, name, modes)
+            _picture(out, name, modes)
     _gallery(out, chosen)
     return _conclude(out, found, machine, small)
 
@@ -167,9 +183,11 @@ def _row(out: Path, name: str, mode: str, scene: Scene, steps: int | None, devic
         if any(body.inside for body in scene.bodies if isinstance(body, Cloth)):
             print("note: the paper's mode has no pressure or volume inside of cloth; closed cloth is empty there", flush=True)
         scene = paper_mode(scene, ROWS[name].order)
-    done = _common.simulated(scene, folder, label, device, steps)
+    looks: list[tuple[float, int]] = []  # after each step: s of the processor, bytes
+    done = _common.simulated(scene, folder, label, device, steps, lambda: looks.append((time.process_time(), used_memory())))
     made_from = hashlib.sha256(f"{scene.model_dump_json()} {done.frame_count}".encode()).hexdigest()
-    if (known := _known(out, name, mode)) and known["made_from"] == made_from:
+    known = _known(out, name, mode)
+    if known and known["made_from"] == made_from:
         return known
     crossing = _common.intersections(done)
     totals = [sum(record["milliseconds"].values()) for record in done.stats]
@@ -184,6 +202,7 @@ def _row(out: Path, name: str, mode: str, scene: Scene, steps: int | None, devic
         "intersections": sum(crossing),
         "median ms": round(statistics.median(totals), 2),
         "p95 ms": round(float(np.percentile(totals, 95)), 2),
+        **_used(looks),
         "energy gained, J": _gained(done),
         "away from default, mm": _away(out, name, done) if mode == "paper" else None,
         "degrees_of_freedom": 3 * _simulated(assembly)[-1].last,
@@ -193,6 +212,15 @@ def _row(out: Path, name: str, mode: str, scene: Scene, steps: int | None, devic
     }
     (out / f"{name}-{mode}.json").write_text(json.dumps(row, indent=1))
     return row
+
+
+def _used(looks: Sequence[tuple[float, int]]) -> dict[str, Any]:
+    """What a step takes of the processor, ms of all threads together in the median, and the most memory that the process had."""
+    spent = [1e3 * (b[0] - a[0]) for a, b in itertools.pairwise(looks)]
+    return {
+        "processor ms": round(statistics.median(spent), 1) if spent else None,
+        "memory, MiB": round(max(memory for _, memory in looks) / 2**20) if looks else None,
+    }
 
 
 def _known(out: Path, name: str, mode: str) -> dict[str, Any] | None:
@@ -264,7 +292,7 @@ def _write(out: Path, found: list[dict[str, Any]], machine: str, small: bool) ->
     for row in found:
         if not lines or lines[-1][0] != row["title"]:
             lines.append((row["title"], "paper, RTX 3090", *ROWS[row["row"]].paper, *("",) * len(JUDGED)))
-        told = [row[name] for name in JUDGED]
+        told = [row.get(name) for name in JUDGED]
         lines.append(
             (row["title"], f"here, {row['mode']}", *(row[name] for name in COLUMNS), *("" if x is None else x for x in told))
         )
@@ -334,21 +362,23 @@ def _conclude(out: Path, found: list[dict[str, Any]], machine: str, small: bool)
         for column, theirs in zip(COLUMNS, ROWS[row["row"]].paper, strict=True):
             table.add_row(column, theirs, str(row[column]))
         for column in JUDGED:
-            if row[column] is not None:
+            if row.get(column) is not None:
                 table.add_row(column, "", str(row[column]))
         console.print(table)
+    on_cpu = all(row.get("processor ms") and row["device"] == "cpu" for row in found)
+    key, clock = ("processor ms", "ms of the processor") if on_cpu else ("median ms", "ms")
     figure, axis = plt.subplots(figsize=(7, 4.6), layout="constrained")
     told = []
     for mode, marker in zip(MODES, "os", strict=True):
         own = [row for row in found if row["mode"] == mode]
-        size, took = ([row[key] for row in own] for key in ("degrees_of_freedom", "median ms"))
+        size, took = ([row[column] for row in own] for column in ("degrees_of_freedom", key))
         if own:
             axis.loglog(size, took, marker, label=f"{mode} mode, median step")
             for row, x, y in zip(own, size, took, strict=True):
                 axis.annotate(row["title"], (x, y), fontsize=7, xytext=(4, 3), textcoords="offset points")
         if len(set(size)) > 2:
             told.append(f"{mode} mode: time grows as DOF^{np.polyfit(np.log(size), np.log(took), 1)[0]:.2f}")
-    axis.set(xlabel="degrees of freedom", ylabel="ms")
+    axis.set(xlabel="degrees of freedom", ylabel=clock)
     axis.set_title(machine, fontsize=9)
     axis.legend()
     axis.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""How much memory is free, for refusing what needs more before it is asked for."""
+"""How much memory is free, for refusing what needs more before it is asked for; and how much this process has."""
 
 from pathlib import Path
 
@@ -15,6 +15,11 @@ def free_memory() -> int:
         return min(free, max(0, int(limit) - int(used)))
     except (OSError, ValueError):  # no container, or one without a limit
         return free
+
+
+def used_memory() -> int:
+    """Bytes of the machine's memory that this process has."""
+    return psutil.Process().memory_info().rss
 
 
 def gib(size: int) -> str:
