@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from physics.scenes import scene, solid
+from physics.scenes import rod, scene, solid
 
 import pdipc
 
@@ -110,3 +110,18 @@ def test_a_plate_pushes_what_is_in_its_way(speed):
     assert all(result.converged and result.lag == 0.0 for result in results)
     assert max(result.outer for result in results) <= 25
     assert simulation.state.velocities.numpy()[:64, 1].mean() > 0.5 * speed
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_rope_on_a_line_does_not_turn_about_it(precision):
+    """There the small motions of one that hangs or hardly sags are large angles."""
+    ropes = []
+    for k, select in enumerate(
+        [{"box": ((-0.51, -1.0, -1.0), (-0.49, 1.0, 1.0))}, {"box": ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))}]
+    ):
+        pins = [{"select": select}] if k == 0 else [{"select": {"vertices": [0, 20]}}]
+        ropes.append(rod(f"rope{k}", 1.0, 20, radius=0.01, at=(0.0, 0.3 * k, 0.0), pins=pins))
+    simulation = pdipc.Simulation(scene(ropes, precision=precision), "cpu")
+    results = [simulation.step() for _ in range(12)]
+    assert all(result.converged for result in results), [result.message for result in results]
+    assert max(result.outer for result in results) <= 12

@@ -49,6 +49,7 @@ from pdipc.nonlinear.descent import Descent, Search, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
 GRIP = 1.0e6  # how much more than all of them those weigh that are held
+ON_A_LINE = 1.0e-5  # of the sum of m |arm|^2: the inertia about an axis that a body is taken to turn about
 MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
@@ -189,6 +190,7 @@ def kernels(real: Real) -> SimpleNamespace:
     def find_turn(
         first: int,
         bodies: Samples,
+        free: wp.array(dtype=scalar),
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
@@ -198,7 +200,8 @@ def kernels(real: Real) -> SimpleNamespace:
         part_out: wp.array(dtype=scalar),
     ):
         """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point, as its samples tell.
-        A part of the step is made where all of it would rotate by more than MOST_TURN."""
+        A part of the step is made where all of it would rotate by more than MOST_TURN. What lies on a line, as ropes do, does not turn about it: there any small
+        motion is a large angle."""
         worker = first + wp.tid()
         b = worker // wp.block_dim()
         lane = worker % wp.block_dim()
@@ -222,6 +225,7 @@ def kernels(real: Real) -> SimpleNamespace:
             mean = mean / total
         momentum = wp.vec3d()
         square = wide(0.0)
+        loose = wide(0.0)
         outer = wp.mat33d()
         for k in range(start + lane, end, wp.block_dim()):
             i = bodies.vertices[k]
@@ -229,20 +233,44 @@ def kernels(real: Real) -> SimpleNamespace:
             arm = widened((base[i] - origin) + u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
+            if free[i] > scalar(0.0):
+                loose += m * wp.length_sq(arm)
             outer += m * wp.outer(arm, arm)
         momentum = total_vector(momentum)
         square = total_number(square)
+        loose = total_number(loose)
         outer = total_matrix(outer)
         if lane == 0:
             turn = wp.vec3d()
             if square > wide(0.0):
-                turn = wide(stretch[0]) * turned(square, outer, momentum)
+                turn = turned(square, outer, momentum)
+                if wp.dot(turn, momentum) < wide(ON_A_LINE) * loose * wp.length_sq(turn):
+                    turn = wp.vec3d()
+                turn = wide(stretch[0]) * turn
             if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
             part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
             center_out[b] = widened(origin) + center
-            turn_out[b] = part * turn
+            turn_out[b] = turn
             part_out[b] = scalar(part)
+
+    @kernel(module)
+    def share_part(
+        first: int,
+        bodies: int,
+        label: wp.array(dtype=wp.int32),
+        part: wp.array(dtype=scalar),
+        least_out: wp.array(dtype=scalar),
+        turn: wp.array(dtype=wp.vec3d),
+    ):
+        """All bodies of an island make the same part of the step: only that descends. least_out: that of each body's island."""
+        for b in range(bodies):
+            least_out[b] = scalar(1.0)
+        for b in range(bodies):
+            least_out[label[b]] = wp.min(least_out[label[b]], part[b])
+        for b in range(bodies):
+            least_out[b] = least_out[label[b]]
+            turn[b] = wide(least_out[b]) * turn[b]
 
     @kernel(module)
     def propose(
@@ -325,6 +353,7 @@ def kernels(real: Real) -> SimpleNamespace:
         look_ahead=look_ahead,
         begin=begin,
         find_turn=find_turn,
+        share_part=share_part,
         propose=propose,
         any_driven=any_driven,
         set_flag=set_flag,
@@ -385,7 +414,7 @@ class Newton(Descent):
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
         self.moved, self.curves = (zeros(scalar) for _ in range(2))
         self.lengths, self.stretch, self.unrestrained = zeros(scalar, 2), zeros(scalar, 1), zeros(scalar, self.bodies)
-        self.part = zeros(scalar, self.bodies)
+        self.own_part, self.part = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.renew, self.driving = zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.driven = zeros(wp.int32)
         self.nobody = zeros(wp.int32, len(work.script.movers))
@@ -459,8 +488,9 @@ class Newton(Descent):
         inputs += [self.measured.share, self.largest, self.stretch]
         device.launch_blocks(k.measure, self.measured.number, inputs, grain=self.measured.size)
         if self.bodies:
-            inputs = [self.samples, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.part]
+            inputs = [self.samples, model.free, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.own_part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
+            device.launch_serial(k.share_part, [self.bodies, self.islands.label, self.own_part, self.part, self.turn])
         inputs = [led, self.p, self.islands.body, self.center, self.turn, self.part, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
