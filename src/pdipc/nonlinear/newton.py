@@ -33,6 +33,7 @@ import warp as wp
 from pdipc.barrier import exact, friction
 from pdipc.barrier.pairs import Exerted, frozen
 from pdipc.barrier.restitution import Restitution
+from pdipc.collision.islands import Groups
 from pdipc.constraints.projector import corners
 from pdipc.constraints.projector import kernels_of as elastic_kernels
 from pdipc.device import blocks
@@ -45,7 +46,7 @@ from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, Search, curved, turned, widened
+from pdipc.nonlinear.descent import Descent, Search, curved, motion, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
 GRIP = 1.0e6  # how much more than all of them those weigh that are held
@@ -73,7 +74,7 @@ class Samples:
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4, Led = real.scalar, real.vec3, real.vec4, led(real)
-    Frozen, Progress, Corners = frozen(real), status.progress(real), corners(real)
+    Frozen, Progress, Corners, Motion = frozen(real), status.progress(real), corners(real), motion(real)
     change, elastic_total = exact.kernels(real).change, elastic_kernels(real).total
     block_largest, last_block = blocks.largest(vec4), blocks.last()
     module = real.module(__name__)
@@ -186,17 +187,32 @@ def kernels(real: Real) -> SimpleNamespace:
         if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
             p_out[i] = (o.target[i] - o.base[i]) - o.u[i]
 
+    @func
+    def share_part(
+        islands: Groups,
+        part: wp.array(dtype=scalar),
+        least_out: wp.array(dtype=scalar),
+        turn: wp.array(dtype=wp.vec3d),
+    ):
+        """All bodies of an island make the same part of the step: only that descends. least_out: that of each body's island."""
+        for b in range(islands.count):
+            least_out[b] = scalar(1.0)
+        for b in range(islands.count):
+            least_out[islands.label[b]] = wp.min(least_out[islands.label[b]], part[b])
+        for b in range(islands.count):
+            least_out[b] = least_out[islands.label[b]]
+            turn[b] = wide(least_out[b]) * turn[b]
+
     @kernel(module)
     def find_turn(
         first: int,
         bodies: Samples,
-        free: wp.array(dtype=scalar),
-        base: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        o: Motion,
         p: wp.array(dtype=vec3),
         stretch: wp.array(dtype=scalar),
-        center_out: wp.array(dtype=wp.vec3d),
-        turn_out: wp.array(dtype=wp.vec3d),
+        islands: Groups,
+        arrived: wp.array(dtype=wp.int32),
+        own_part: wp.array(dtype=scalar),
         part_out: wp.array(dtype=scalar),
     ):
         """By how much the step, p as often as it is tried, rotates each body as a whole, rad, and about which point, as its samples tell.
@@ -207,7 +223,7 @@ def kernels(real: Real) -> SimpleNamespace:
         lane = worker % wp.block_dim()
         start = bodies.starts[b]
         end = bodies.starts[b + 1]
-        origin = base[bodies.vertices[start]]
+        origin = o.base[bodies.vertices[start]]
         total = wide(0.0)
         center = wp.vec3d()
         mean = wp.vec3d()
@@ -215,7 +231,7 @@ def kernels(real: Real) -> SimpleNamespace:
             i = bodies.vertices[k]
             m = bodies.weights[k]
             total += m
-            center += m * widened((base[i] - origin) + u[i])
+            center += m * widened((o.base[i] - origin) + o.u[i])
             mean += m * widened(p[i])
         total = total_number(total)
         center = total_vector(center)
@@ -230,10 +246,10 @@ def kernels(real: Real) -> SimpleNamespace:
         for k in range(start + lane, end, wp.block_dim()):
             i = bodies.vertices[k]
             m = bodies.weights[k]
-            arm = widened((base[i] - origin) + u[i]) - center
+            arm = widened((o.base[i] - origin) + o.u[i]) - center
             momentum += m * wp.cross(arm, widened(p[i]) - mean)
             square += m * wp.length_sq(arm)
-            if free[i] > scalar(0.0):
+            if o.free[i] > scalar(0.0):
                 loose += m * wp.length_sq(arm)
             outer += m * wp.outer(arm, arm)
         momentum = total_vector(momentum)
@@ -250,27 +266,12 @@ def kernels(real: Real) -> SimpleNamespace:
             if not (wp.length(turn) < wide(wp.inf)):
                 turn = wp.vec3d()
             part = wp.min(wide(1.0), wide(MOST_TURN) / wp.max(wp.length(turn), wide(MOST_TURN)))
-            center_out[b] = widened(origin) + center
-            turn_out[b] = turn
-            part_out[b] = scalar(part)
-
-    @kernel(module)
-    def share_part(
-        first: int,
-        bodies: int,
-        label: wp.array(dtype=wp.int32),
-        part: wp.array(dtype=scalar),
-        least_out: wp.array(dtype=scalar),
-        turn: wp.array(dtype=wp.vec3d),
-    ):
-        """All bodies of an island make the same part of the step: only that descends. least_out: that of each body's island."""
-        for b in range(bodies):
-            least_out[b] = scalar(1.0)
-        for b in range(bodies):
-            least_out[label[b]] = wp.min(least_out[label[b]], part[b])
-        for b in range(bodies):
-            least_out[b] = least_out[label[b]]
-            turn[b] = wide(least_out[b]) * turn[b]
+            o.center[b] = widened(origin) + center
+            o.turn[b] = turn
+            own_part[b] = scalar(part)
+        if last_block(arrived, 0, islands.count):  # noqa: SIM102  (all threads of a block ask)
+            if lane == 0:
+                share_part(islands, own_part, part_out, o.turn)
 
     @kernel(module)
     def propose(
@@ -353,7 +354,6 @@ def kernels(real: Real) -> SimpleNamespace:
         look_ahead=look_ahead,
         begin=begin,
         find_turn=find_turn,
-        share_part=share_part,
         propose=propose,
         any_driven=any_driven,
         set_flag=set_flag,
@@ -415,7 +415,7 @@ class Newton(Descent):
         self.moved, self.curves = (zeros(scalar) for _ in range(2))
         self.lengths, self.stretch, self.unrestrained = zeros(scalar, 2), zeros(scalar, 1), zeros(scalar, self.bodies)
         self.own_part, self.part = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
-        self.renew, self.driving = zeros(wp.int32, 1), zeros(wp.int32, 1)
+        self.renew, self.driving, self.turns_found = (zeros(wp.int32, 1) for _ in range(3))
         self.driven = zeros(wp.int32)
         self.nobody = zeros(wp.int32, len(work.script.movers))
         self.largest_of_two = Largest(device, real, [n] * 2)
@@ -488,9 +488,8 @@ class Newton(Descent):
         inputs += [self.measured.share, self.largest, self.stretch]
         device.launch_blocks(k.measure, self.measured.number, inputs, grain=self.measured.size)
         if self.bodies:
-            inputs = [self.samples, model.free, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.own_part]
-            device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
-            device.launch_serial(k.share_part, [self.bodies, self.islands.label, self.own_part, self.part, self.turn])
+            inputs = [self.samples, self.motion, self.p, self.stretch, self.islands.groups, self.turns_found]
+            device.launch_blocks(k.find_turn, self.bodies, [*inputs, self.own_part, self.part], grain=SAMPLES)
         inputs = [led, self.p, self.islands.body, self.center, self.turn, self.part, self.stretch]
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
