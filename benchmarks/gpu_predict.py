@@ -137,8 +137,7 @@ def predict(name: str, row: dict) -> dict:
         (going,): outer,
         (going, method.renew.ptr): outer,
         conjugate: row["linear_iterations"] / ITERATIONS,
-        (going, work.truncation.going.ptr): outer + row["truncations"],
-        (going, work.truncation.going.ptr, work.truncation.any_hit.ptr): row["truncations"],
+        (going, work.truncation.any_hit.ptr): row["truncations"],
         (going, work.candidates.needed.ptr): 1.0,  # a list lasts for about a step
     }
     launches = sum(number * len(place.launches[key]) for key, number in turns.items())

@@ -246,31 +246,23 @@ def kernels(real: Real) -> SimpleNamespace:
                 lever_out[k] = lever
                 hessian_out[k] = hessian
 
-    @kernel(module)
-    def measure_change(
-        first: int,
-        pairs: Frozen,
-        p: wp.array(dtype=vec3),
-        held: wp.array(dtype=scalar),
-        change_out: wp.array(dtype=scalar),
-    ):
-        """By how much the motion p changes the curvature of each pair's barrier, as part of what it is with the inertia that it acts against."""
-        k = first + wp.tid()
-        result = zero
-        if k < pairs.count[0]:
-            q = pairs.quads[k]
-            a = pairs.weights[k]
-            lever = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
-            yields = zero
-            for s in range(4):
-                if held[q[s]] > zero:
-                    yields += a[s] * a[s] / held[q[s]]
-            d = wp.abs(pairs.gaps[k])  # that of a pair that is foreseen has the sign of its side
-            after = wp.max(d + wp.dot(pairs.normals[k], lever), scalar(0.1) * d)
-            now = pairs.stiffness[k] * yields * barrier.barrier_hessian(d, pairs.activation[k])
-            then = pairs.stiffness[k] * yields * barrier.barrier_hessian(after, pairs.activation[k])
-            result = wp.abs(then - now) / wp.max(now, one)
-        change_out[k] = result
+    @func
+    def change(k: int, pairs: Frozen, p: wp.array(dtype=vec3), held: wp.array(dtype=scalar)) -> scalar:
+        """By how much the motion p would change the curvature of the barrier of pair k, as part of that, or of the inertia that it acts against
+        where that is more. held: kg/s^2, mass over h^2.
+        """
+        q = pairs.quads[k]
+        a = pairs.weights[k]
+        lever = a[1] * (p[q[1]] - p[q[0]]) + a[2] * (p[q[2]] - p[q[0]]) + a[3] * (p[q[3]] - p[q[0]])
+        yields = zero
+        for s in range(4):
+            if held[q[s]] > zero:
+                yields += a[s] * a[s] / held[q[s]]
+        d = wp.abs(pairs.gaps[k])  # that of a pair that is foreseen has the sign of its side
+        after = wp.max(d + wp.dot(pairs.normals[k], lever), scalar(0.1) * d)
+        now = pairs.stiffness[k] * yields * barrier.barrier_hessian(d, pairs.activation[k])
+        then = pairs.stiffness[k] * yields * barrier.barrier_hessian(after, pairs.activation[k])
+        return wp.abs(then - now) / wp.max(now, one)
 
     @kernel(module)
     def gather(
@@ -369,7 +361,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         differentiate=differentiate,
-        measure_change=measure_change,
+        change=change,
         gather=gather,
         stretch=stretch,
         spread=spread,
@@ -403,13 +395,6 @@ class BarrierTerm(ActivePairs):
         self.first_bent, self.second_bent = (wp.zeros(capacity, dtype=mat43, device=device) for _ in range(2))
         self.felt, self.across = (wp.zeros(capacity, dtype=real.vec3, device=device) for _ in range(2))
         self.rows = None if self.device.wide else ContactRows(self.device, real, len(self.kappa), capacity)
-        self.change = wp.zeros(capacity, dtype=real.scalar, device=device)
-
-    def measure_change(self, p: wp.array, held: wp.array) -> None:
-        """Launches `change`: by how much the motion p would change the curvature of each frozen pair, as part of that, or of the inertia
-        that it acts against where that is more. held: (n,) kg/s^2, mass over h^2.
-        """
-        self.device.launch(self.exact.measure_change, self.capacity, [self.frozen, p, held, self.change], grain=4)
 
     def differentiate(self, x: wp.array) -> None:
         """Launches energy, force and Hessian at the frozen positions x."""

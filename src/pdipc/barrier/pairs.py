@@ -23,8 +23,9 @@ import warp as wp
 
 from pdipc.barrier import potential as barrier
 from pdipc.collision import distance
-from pdipc.collision.candidates import SILENT, Candidates
+from pdipc.collision.candidates import SILENT, Candidates, grouped
 from pdipc.collision.candidates import listed as candidates_of
+from pdipc.device import blocks
 from pdipc.device.language import Function, filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
@@ -54,6 +55,18 @@ def frozen(real: Real) -> Any:
     )
 
 
+@functools.cache
+def brought(real: Real) -> Any:
+    """A struct: what vertices bring to their pairs; see `FrozenPairs`."""
+    return struct_of(
+        "Brought",
+        __name__,
+        kappa=wp.array(dtype=real.scalar),
+        friction=wp.array(dtype=real.scalar),
+        free=wp.array(dtype=real.scalar),
+    )
+
+
 @func
 def pair_stiffness(a: Scalar, b: Scalar, mollifier: Scalar):
     """N/m, of a pair whose sides bring a and b: their mean, since a pair is as stiff as its bodies are heavy; kinematic vertices, which bring 0,
@@ -77,12 +90,14 @@ def counts_here(q: wp.vec4i, s: int, free: wp.array(dtype=Scalar)) -> bool:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    Frozen, Listed = frozen(real), candidates_of(real)
+    Frozen, Brought, Listed, Grouped = frozen(real), brought(real), candidates_of(real), grouped(real)
     scalar, vec2, vec3, vec4, mat33 = real.scalar, real.vec2, real.vec3, real.vec4, real.mat33
     module = real.module(__name__)
     far = wp.constant(real.scalar(1.0e30))
     least = wp.constant(real.scalar(LEAST_GAP * real.unit_roundoff))
     silent = wp.constant(SILENT)
+    block_total, block_least = blocks.total(wp.int32), blocks.least(scalar)
+    block_scan, last_block = blocks.scan(), blocks.last()
 
     @func
     def vertex_triangle_gap(x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
@@ -109,10 +124,17 @@ def kernels(real: Real) -> SimpleNamespace:
         return wp.length(w[1] * (a1 - a0) + w[2] * (b0 - a0) + w[3] * (b1 - a0)) - limits[0]
 
     @func
+    def gap_of(edges: bool, x: wp.array(dtype=vec3), q: wp.vec4i, limits: vec2) -> scalar:
+        if edges:
+            return edge_edge_gap(x, q, limits)
+        return vertex_triangle_gap(x, q, limits)
+
+    @func
     def foreseen(
-        gap: scalar, q: wp.vec4i, a: vec4, limits: vec2, x: wp.array(dtype=vec3), ahead: wp.array(dtype=vec3)
+        edges: bool, gap: scalar, q: wp.vec4i, limits: vec2, x: wp.array(dtype=vec3), ahead: wp.array(dtype=vec3)
     ) -> scalar:
         """The gap, negative where the motion x -> ahead closes it to less than the part FORESEEN of d_hat."""
+        a = vec4(distance.pair_weights(edges, x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
         r = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
         apart = wp.length(r)
         left = apart - limits[0]
@@ -124,47 +146,47 @@ def kernels(real: Real) -> SimpleNamespace:
             return -left
         return gap
 
-    def measure(kind: str, gap_of):
-        edge_edge = kind == "edge_edge"
-
-        @kernel(module, f"measure_{kind}")
-        def measure_gaps(
-            span: Span,
-            c: Listed,
-            x: wp.array(dtype=vec3),
-            ahead: wp.array(dtype=vec3),
-            driven: wp.array(dtype=wp.int32),
-            gaps_out: wp.array(dtype=scalar),
-            active_out: wp.array(dtype=wp.int32),
-            closest_out: wp.array(dtype=scalar),
-        ):
-            """Gaps of the candidates; for each block how many are active, and the negative of the smallest gap of those."""
-            worker = span.first + wp.tid()
-            for begin in range(worker * span.block, c.quads.shape[0], span.step * span.block):
-                active = int(0)
-                smallest = far
-                for k in range(begin, wp.min(begin + span.block, c.count[0])):
+    @kernel(module)
+    def measure(
+        span: Span,
+        points: Listed,
+        lines: Listed,
+        x: wp.array(dtype=vec3),
+        ahead: wp.array(dtype=vec3),
+        driven: wp.array(dtype=wp.int32),
+    ):
+        """Gaps of the candidates, first of those of a vertex and a triangle; far where they are not active."""
+        worker = span.first + wp.tid()
+        count = points.count[0] + lines.count[0]
+        for begin in range(worker * span.block, count, span.step * span.block):
+            for i in range(begin, wp.min(begin + span.block, count)):
+                edges = i >= points.count[0]
+                k = i
+                q = wp.vec4i()
+                limits = vec2()
+                face = int(silent)
+                if edges:
+                    k = i - points.count[0]
+                    q = lines.quads[k]
+                    limits = lines.limits[k]
+                    face = lines.faces[k]
+                else:
+                    q = points.quads[k]
+                    limits = points.limits[k]
+                    face = points.faces[k]
+                gap = far
+                if face != silent:
                     # CCD has proven it positive; measured in this precision it may round to less, of which there is no logarithm
+                    gap = wp.max(gap_of(edges, x, q, limits), least * limits[1])
+                    if ahead:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                        if driven[q[0]] + driven[q[1]] + driven[q[2]] + driven[q[3]] > 0:
+                            gap = foreseen(edges, gap, q, limits, x, ahead)
+                if gap >= limits[1]:
                     gap = far
-                    if c.faces[k] != silent:
-                        gap = wp.max(gap_of(x, c.quads[k], c.limits[k]), least * c.limits[k][1])
-                        if ahead:
-                            q = c.quads[k]
-                            if driven[q[0]] + driven[q[1]] + driven[q[2]] + driven[q[3]] > 0:
-                                a = vec4()
-                                if wp.static(edge_edge):
-                                    a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                                else:
-                                    a = vec4(distance.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                                gap = foreseen(gap, q, a, c.limits[k], x, ahead)
-                    gaps_out[k] = gap
-                    if gap < c.limits[k][1]:
-                        active += 1
-                        smallest = wp.min(smallest, gap)
-                active_out[begin // span.block] = active
-                closest_out[begin // span.block] = -smallest
-
-        return measure_gaps
+                if edges:
+                    lines.gaps[k] = gap
+                else:
+                    points.gaps[k] = gap
 
     @func
     def nearest_of_face(k: int, c: Listed) -> bool:
@@ -185,97 +207,142 @@ def kernels(real: Real) -> SimpleNamespace:
                         j += step
         return nearest
 
-    @kernel(module)
-    def claim(span: Span, c: Listed, active_out: wp.array(dtype=wp.int32)):
-        """For each block how many are active, of a flat face one."""
-        worker = span.first + wp.tid()
-        for begin in range(worker * span.block, c.quads.shape[0], span.step * span.block):
-            active = int(0)
-            for k in range(begin, wp.min(begin + span.block, c.count[0])):
-                if c.gaps[k] < c.limits[k][1]:  # noqa: SIM102  (Warp evaluates both sides of an "and")
-                    if nearest_of_face(k, c):
-                        active += 1
-            active_out[begin // span.block] = active
+    @func
+    def acts(edges: bool, k: int, c: Listed) -> bool:
+        """Whether a pair is active; of those of a flat face one is."""
+        active = c.gaps[k] < far
+        if active and not edges:
+            active = nearest_of_face(k, c)
+        return active
+
+    @func
+    def of_kind(edges: bool, points: Listed, lines: Listed) -> Listed:
+        if edges:
+            return lines
+        return points
 
     @kernel(module)
-    def total(
+    def count_active(
         first: int,
-        ends_a: wp.array(dtype=wp.int32),
-        ends_b: wp.array(dtype=wp.int32),
+        points: Listed,
+        lines: Listed,
+        o: Grouped,
         capacity: int,
         count_out: wp.array(dtype=wp.int32),
+        closest_out: wp.array(dtype=scalar),
         overflow: wp.array(dtype=wp.int32),
     ):
-        """count: pairs that fit, the most ever found, those of the first kind."""
-        first_kind = ends_a[ends_a.shape[0] - 1]
-        found = first_kind + ends_b[ends_b.shape[0] - 1]
-        count_out[0] = wp.min(found, capacity)
-        count_out[1] = wp.max(count_out[1], found)
-        count_out[2] = first_kind
-        if found > capacity:
-            overflow[0] = 1
-
-    def freeze(kind: str):
-        edge_edge = kind == "edge_edge"
-
-        @kernel(module, f"freeze_{kind}")
-        def freeze_pairs(
-            span: Span,
-            c: Listed,
-            x: wp.array(dtype=vec3),
-            ends: wp.array(dtype=wp.int32),
-            kappa: wp.array(dtype=scalar),
-            friction: wp.array(dtype=scalar),
-            free: wp.array(dtype=scalar),
-            pairs_out: Frozen,
-            share_out: wp.array(dtype=scalar),
-        ):
-            worker = span.first + wp.tid()
-            for begin in range(worker * span.block, c.count[0], span.step * span.block):
-                slot = int(0)
-                if begin > 0:
-                    slot = ends[begin // span.block - 1]
-                if wp.static(edge_edge):
-                    slot += pairs_out.count[2]
-                for k in range(begin, wp.min(begin + span.block, c.count[0])):
-                    d_hat = c.limits[k][1]
-                    acts = c.gaps[k] < d_hat and slot < pairs_out.quads.shape[0]
-                    if wp.static(not edge_edge):  # noqa: SIM102  (known when the kernel is made)
-                        if acts:
-                            acts = nearest_of_face(k, c)
-                    if acts:
-                        q = c.quads[k]
-                        p0 = x[q[0]]
-                        p1 = x[q[1]] - p0
-                        p2 = x[q[2]] - p0
-                        p3 = x[q[3]] - p0
-                        zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-                        m = scalar(1.0)
-                        a = vec4()
-                        if wp.static(edge_edge):
-                            a = vec4(distance.edge_edge_weights(zero, p1, p2, p3))
-                            m = barrier.mollifier(zero, p1, p2, p3)
-                        else:
-                            a = vec4(distance.vertex_triangle_weights(zero, p1, p2, p3))
-                        r = a[1] * p1 + a[2] * p2 + a[3] * p3
-                        n = wp.normalize(r)
-                        d0 = c.gaps[k]
-                        pairs_out.quads[slot] = q
-                        pairs_out.weights[slot] = a
-                        pairs_out.normals[slot] = n
-                        pairs_out.gaps[slot] = d0
-                        pairs_out.activation[slot] = d_hat
-                        pairs_out.stiffness[slot] = pair_stiffness(kappa[q[0]], kappa[q[3]], m)
-                        pairs_out.coefficient[slot] = wp.sqrt(friction[q[0]] * friction[q[3]])
-                        share = free[q[0]] * wp.abs(a[0]) + free[q[1]] * wp.abs(a[1])
-                        share_out[slot] = share + free[q[2]] * wp.abs(a[2]) + free[q[3]] * wp.abs(a[3])
-                        slot += 1
-
-        return freeze_pairs
+        """A block of threads a group of `size` pairs of one kind: how many are active. Who is last adds up: ends, where the active ones of each
+        group end; count: pairs that fit, the most ever found, those of the first kind.
+        """
+        worker = first + wp.tid()
+        group = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        before_lines = (points.count[0] + o.size - 1) // o.size
+        groups = wp.max(before_lines + (lines.count[0] + o.size - 1) // o.size, 1)
+        if group >= groups:
+            return
+        edges = group >= before_lines
+        c = of_kind(edges, points, lines)
+        begin = group * o.size
+        if edges:
+            begin = (group - before_lines) * o.size
+        active = int(0)
+        closest = far
+        for k in range(begin + lane, wp.min(begin + o.size, c.count[0]), wp.block_dim()):
+            closest = wp.min(closest, c.gaps[k])
+            if acts(edges, k, c):
+                active += 1
+        active = block_total(active)
+        closest = block_least(closest)
+        if lane == 0:
+            o.ends[group] = active
+            o.smallest[group] = closest
+        if last_block(o.arrived, 0, groups):
+            found = int(0)
+            closest = far
+            for start in range(0, groups, wp.block_dim()):
+                g = start + lane
+                own = int(0)
+                if g < groups:
+                    own = o.ends[g]
+                    closest = wp.min(closest, o.smallest[g])
+                end = found + block_scan(own)
+                if g < groups:
+                    o.ends[g] = end
+                found += block_total(own)
+            closest = block_least(closest)
+            if lane == 0:
+                count_out[0] = wp.min(found, capacity)
+                count_out[1] = wp.max(count_out[1], found)
+                count_out[2] = 0
+                if before_lines > 0:
+                    count_out[2] = o.ends[before_lines - 1]
+                closest_out[0] = closest
+                if found > capacity:
+                    overflow[0] = 1
 
     @kernel(module)
-    def clear(first: int, values_out: wp.array(dtype=wp.int32)):
-        values_out[first + wp.tid()] = 0
+    def freeze(
+        first: int,
+        points: Listed,
+        lines: Listed,
+        o: Grouped,
+        x: wp.array(dtype=vec3),
+        brought: Brought,
+        degree: wp.array(dtype=wp.int32),
+        pairs_out: Frozen,
+        share_out: wp.array(dtype=scalar),
+    ):
+        """The active pairs of each group, in their order. degree: where it is given, how many pairs each vertex has."""
+        worker = first + wp.tid()
+        group = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        before_lines = (points.count[0] + o.size - 1) // o.size
+        if group >= before_lines + (lines.count[0] + o.size - 1) // o.size:
+            return
+        slot = int(0)
+        if group > 0:
+            slot = o.ends[group - 1]
+        if o.ends[group] == slot:
+            return
+        edges = group >= before_lines
+        c = of_kind(edges, points, lines)
+        begin = group * o.size
+        if edges:
+            begin = (group - before_lines) * o.size
+        end = wp.min(begin + o.size, c.count[0])
+        for start in range(begin, end, wp.block_dim()):
+            k = start + lane
+            active = int(0)
+            if k < end:  # noqa: SIM102  (Warp evaluates both sides of an "and")
+                if acts(edges, k, c):
+                    active = 1
+            own = slot + block_scan(active) - 1
+            slot += block_total(active)
+            if active == 1 and own < pairs_out.quads.shape[0]:
+                q = c.quads[k]
+                p0 = x[q[0]]
+                p1 = x[q[1]] - p0
+                p2 = x[q[2]] - p0
+                p3 = x[q[3]] - p0
+                zero = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+                a = vec4(distance.pair_weights(edges, zero, p1, p2, p3))
+                m = scalar(1.0)
+                if edges:
+                    m = barrier.mollifier(zero, p1, p2, p3)
+                pairs_out.quads[own] = q
+                pairs_out.weights[own] = a
+                pairs_out.normals[own] = wp.normalize(a[1] * p1 + a[2] * p2 + a[3] * p3)
+                pairs_out.gaps[own] = c.gaps[k]
+                pairs_out.activation[own] = c.limits[k][1]
+                pairs_out.stiffness[own] = pair_stiffness(brought.kappa[q[0]], brought.kappa[q[3]], m)
+                pairs_out.coefficient[own] = wp.sqrt(brought.friction[q[0]] * brought.friction[q[3]])
+                share = brought.free[q[0]] * wp.abs(a[0]) + brought.free[q[1]] * wp.abs(a[1])
+                share_out[own] = share + brought.free[q[2]] * wp.abs(a[2]) + brought.free[q[3]] * wp.abs(a[3])
+                if degree:
+                    for s in range(4):
+                        wp.atomic_add(degree, q[s], 1)
 
     @kernel(module)
     def count_incident(
@@ -296,6 +363,7 @@ def kernels(real: Real) -> SimpleNamespace:
         degree: wp.array(dtype=wp.int32),
         entries_out: wp.array(dtype=wp.int32),
     ):
+        """Takes off `degree` what was counted: it is left at zero."""
         worker = span.first + wp.tid()
         for b in range(worker * span.block, count[0], span.step * span.block):
             for k in range(b, wp.min(b + span.block, count[0])):
@@ -440,13 +508,9 @@ def kernels(real: Real) -> SimpleNamespace:
             energy_out[k] = pairs.stiffness[k] * barrier.barrier(pairs.gaps[k], pairs.activation[k])
 
     return SimpleNamespace(
-        total=total,
-        claim=claim,
-        measure_vertex_triangle=measure("vertex_triangle", vertex_triangle_gap),
-        measure_edge_edge=measure("edge_edge", edge_edge_gap),
-        freeze_vertex_triangle=freeze("vertex_triangle"),
-        freeze_edge_edge=freeze("edge_edge"),
-        clear=clear,
+        measure=measure,
+        count_active=count_active,
+        freeze=freeze,
         count_incident=count_incident,
         fill_incident=fill_incident,
         sort_incident=sort_incident,
@@ -495,8 +559,10 @@ class FrozenPairs:
         n = len(kappa)
         self.device, self.real, self.kernels = device, real, kernels(real)
         self.kappa, self.friction_of_vertex, self.free, self.slip_threshold = kappa, friction, free, slip_threshold
+        self.brought = brought(real)()
+        self.brought.kappa, self.brought.friction, self.brought.free = kappa, friction, free
         self.count = wp.zeros(3, dtype=wp.int32, device=device.warp)  # pairs in use; most found; of these vertex-triangle
-        self.closest = wp.zeros(2, dtype=real.scalar, device=device.warp)  # smallest gap of each kind, negative, m
+        self.closest = wp.zeros(1, dtype=real.scalar, device=device.warp)  # smallest gap, m
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
@@ -531,20 +597,23 @@ class FrozenPairs:
         ahead: (n,) where vertices are going; with it those are listed, too, that have a vertex in `driven`, (n,) int32, and will be nearer than
         FORESEEN d_hat, their gap with a minus. Where they do not fit, `candidates.overflow` is set and the list is incomplete.
         """
-        k, device = self.kernels, self.device
-        for slot, c in enumerate(candidates.lists):
-            inputs = [c.listed, x, ahead, driven, c.gaps, c.found, c.closest]
-            device.launch_list(getattr(k, f"measure_{c.kind}"), c.capacity, inputs)
-            if candidates.surface.has_faces and slot == 0:
-                device.launch_list(k.claim, c.capacity, [c.listed, c.found])
-            device.scan(c.found, c.ends)
-        candidates.largest.find([c.closest for c in candidates.lists], self.closest, [0, 1])
-        ends = [c.ends for c in candidates.lists]
-        device.launch_serial(k.total, [*ends, self.capacity, self.count, candidates.overflow])
-        for c in candidates.lists:
-            inputs = [c.listed, x, c.ends, self.kappa, self.friction_of_vertex, self.free, self.frozen, self.share]
-            device.launch_list(getattr(k, f"freeze_{c.kind}"), c.capacity, inputs)
-        self._index()
+        k, device, groups = self.kernels, self.device, candidates.groups
+        pairs = [each.listed for each in candidates.lists]
+        device.launch_list(k.measure, candidates.capacity, [*pairs, x, ahead, driven])
+        inputs = [*pairs, groups.grouped, self.capacity, self.count, self.closest, candidates.overflow]
+        device.launch_blocks(k.count_active, groups.number, inputs, grain=groups.size)
+        degree = self.degree if device.wide else None
+        inputs = [*pairs, groups.grouped, x, self.brought, degree, self.frozen, self.share]
+        device.launch_blocks(k.freeze, groups.number, inputs, grain=groups.size)
+        # each vertex's pairs, in order
+        if not device.wide:
+            device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
+        device.scan(self.degree, self.ends)
+        filled = self.unsorted if device.wide else self.entries
+        device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, filled])
+        if device.wide:
+            inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries, self.places]
+            device.launch_list(k.sort_incident, self.capacity, inputs)
 
     def expect(self, x: wp.array, x_tilde: wp.array, fraction: wp.array | None = None) -> None:
         """What is left of the motion x -> x~ of which each vertex made `fraction`: only the paper's mode needs to know."""
@@ -556,18 +625,6 @@ class FrozenPairs:
             return False
         self._allocate(found + found // 2)
         return True
-
-    def _index(self) -> None:
-        """Lists each vertex's pairs, in order."""
-        k, device, n = self.kernels, self.device, len(self.degree)
-        device.launch(k.clear, n, [self.degree])
-        device.launch_scatter(k.count_incident, self.capacity, [self.count, self.quads, self.degree])
-        device.scan(self.degree, self.ends)
-        filled = self.unsorted if device.wide else self.entries
-        device.launch_scatter(k.fill_incident, self.capacity, [self.count, self.quads, self.ends, self.degree, filled])
-        if device.wide:
-            inputs = [self.count, self.quads, self.ends, self.unsorted, self.entries, self.places]
-            device.launch_list(k.sort_incident, self.capacity, inputs)
 
     def listed(self, *arrays: wp.array) -> list[np.ndarray]:
         """The entries in use of arrays with one a pair, numbers as float64."""

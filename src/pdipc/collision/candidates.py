@@ -29,8 +29,9 @@ import warp as wp
 from pdipc.collision import distance, sieve
 from pdipc.collision.broad_phase import BroadPhase
 from pdipc.collision.surface import Surface
+from pdipc.device import blocks
 from pdipc.device.language import filled, func, kernel, struct_of
-from pdipc.device.launch import Device, Largest, Span
+from pdipc.device.launch import BLOCK, CPU_BLOCK, Device, Parts, Share, Span
 from pdipc.device.precision import Real, Scalar
 
 REST_FRACTION = 0.8  # a pair of one body acts from this fraction of its distance in the rest shape on, at most
@@ -81,12 +82,43 @@ def listed(real: Real) -> Any:
 
 
 @functools.cache
+def grouped(real: Real) -> Any:
+    """A struct: `Groups` as kernels take them."""
+    return struct_of(
+        "Grouped",
+        __name__,
+        size=int,
+        ends=wp.array(dtype=wp.int32),
+        smallest=wp.array(dtype=real.scalar),  # m
+        arrived=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
+def reuse(real: Real) -> Any:
+    """A struct: the motion that candidates were listed for, and whether they hold for another; see `Candidates`."""
+    return struct_of(
+        "Reuse",
+        __name__,
+        begin=wp.array(dtype=real.vec3),
+        end=wp.array(dtype=real.vec3),
+        margin=real.scalar,
+        overflow=wp.array(dtype=wp.int32),
+        away=wp.array(dtype=wp.int32),  # (4,) whether any vertex begins away from `begin`, or from `end`, or ends so
+        needed=wp.array(dtype=wp.int32),
+        renewed=wp.array(dtype=wp.int32),
+    )
+
+
+@functools.cache
 def kernels(real: Real) -> SimpleNamespace:
     scalar, vec2, vec3, Vertices = real.scalar, real.vec2, real.vec3, vertices(real)
+    Reuse = reuse(real)
     module = real.module(__name__)
     least_margin = wp.constant(wp.float64(LEAST_MARGIN))
     nothing = wp.constant(scalar(IGNORED))
     silent = wp.constant(SILENT)
+    last_block = blocks.last()
 
     @func
     def limits(o: Vertices, a: int, b: int, rest_distance: scalar):
@@ -166,43 +198,30 @@ def kernels(real: Real) -> SimpleNamespace:
         return wp.length(distance.relative(x, y)) <= wp.float64(margin) and wp.float64(margin) > least_margin
 
     @kernel(module)
-    def depart(
-        first: int,
-        x0: wp.array(dtype=vec3),
-        x1: wp.array(dtype=vec3),
-        begin: wp.array(dtype=vec3),
-        end: wp.array(dtype=vec3),
-        margin: scalar,
-        away: wp.array(dtype=wp.int32),
-    ):
-        """away[0] and [1]: whether any x0 is more than the margin away from `begin`, and from `end`; away[2] and [3]: any x1."""
-        i = first + wp.tid()
-        # whoever writes, writes the same
-        if not near(x0[i], begin[i], margin):
-            away[0] = 1
-        if not near(x0[i], end[i], margin):
-            away[1] = 1
-        if not near(x1[i], begin[i], margin):
-            away[2] = 1
-        if not near(x1[i], end[i], margin):
-            away[3] = 1
-
-    @kernel(module)
-    def decide(
-        first: int,
-        away: wp.array(dtype=wp.int32),
-        overflow: wp.array(dtype=wp.int32),
-        needed_out: wp.array(dtype=wp.int32),
-        renewed_out: wp.array(dtype=wp.int32),
-    ):
-        """Clears away for the next time."""
-        needed_out[0] = wp.max(wp.min(away[0], away[1]), wp.min(away[2], away[3]))
-        if overflow[0] != 0:
-            needed_out[0] = 0  # what was found stays known, until there is room for it
-        if needed_out[0] != 0:
-            renewed_out[0] = 1
-        for i in range(4):
-            away[i] = 0
+    def check(first: int, x0: wp.array(dtype=vec3), x1: wp.array(dtype=vec3), parts: Share, o: Reuse):
+        """Who is away, by blocks of threads; the last decides, and clears that for the next time."""
+        worker = first + wp.tid()
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, x0.shape[0]), wp.block_dim()):
+            # whoever writes, writes the same
+            if not near(x0[i], o.begin[i], o.margin):
+                o.away[0] = 1
+            if not near(x0[i], o.end[i], o.margin):
+                o.away[1] = 1
+            if not near(x1[i], o.begin[i], o.margin):
+                o.away[2] = 1
+            if not near(x1[i], o.end[i], o.margin):
+                o.away[3] = 1
+        if last_block(parts.arrived, 0, parts.number):  # noqa: SIM102  (all threads of a block ask)
+            if lane == 0:
+                o.needed[0] = wp.max(wp.min(o.away[0], o.away[1]), wp.min(o.away[2], o.away[3]))
+                if o.overflow[0] != 0:
+                    o.needed[0] = 0  # what was found stays known, until there is room for it
+                if o.needed[0] != 0:
+                    o.renewed[0] = 1
+                for k in range(4):
+                    o.away[k] = 0
 
     @kernel(module)
     def keep(
@@ -220,8 +239,7 @@ def kernels(real: Real) -> SimpleNamespace:
         vertex_triangle_limits=vertex_triangle_limits,
         edge_edge_limits=edge_edge_limits,
         near=near,
-        depart=depart,
-        decide=decide,
+        check=check,
         keep=keep,
     )
 
@@ -231,8 +249,7 @@ class CandidateList:
 
     Vertex-triangle pairs are (v, t0, t1, t2), edge-edge pairs (a0, a1, b0, b1). quads: (capacity,) vec4i. limits: (capacity,)
     vec2 of minimum separation xi and activation distance d_hat, m. faces: (capacity,) int32, the flat face that the triangle of a pair is part of, -1
-    for none, or SILENT. count: (1,) int32 on the device.
-    gaps: (capacity,) m; times: (capacity,) times of impact; found, ends, closest: one number for each block of a `Span`. listed: what kernels take.
+    for none, or SILENT. count: (1,) int32 on the device. gaps: (capacity,) m. listed: all of these as kernels read them.
     """
 
     def __init__(self, device: Device, real: Real, kind: str):
@@ -244,13 +261,26 @@ class CandidateList:
         def make(size: int, dtype) -> wp.array:
             return wp.zeros(size, dtype=dtype, device=self.device.warp)
 
-        real, blocks = self.real, -(-capacity // self.device.block)
-        self.quads = self.limits = self.faces = self.gaps = self.times = self.listed = None  # the old ones are given back first
+        real = self.real
+        self.quads = self.limits = self.faces = self.gaps = self.listed = None  # the old ones are given back first
         self.count, self.capacity = count, capacity
         self.quads, self.limits = make(capacity, wp.vec4i), make(capacity, real.vec2)
-        self.gaps, self.times, self.faces = make(capacity, real.scalar), make(capacity, wp.int32), make(capacity, wp.int32)
-        self.found, self.ends, self.closest = make(blocks, wp.int32), make(blocks, wp.int32), make(blocks, real.scalar)
+        self.gaps, self.faces = make(capacity, real.scalar), make(capacity, wp.int32)
         self.listed = filled(listed(real), self)
+
+
+class Groups:
+    """Candidates that are counted together, `size` of one kind: number, of both kinds in lists of these capacities, of which each may end in a part of a
+    group. ends, smallest: a number for each; arrived: the counter of `blocks.last`. grouped: these as kernels take them.
+    """
+
+    def __init__(self, device: Device, real: Real, capacities: list[int]):
+        self.size = BLOCK if device.wide else CPU_BLOCK
+        self.number = max(1, sum(-(-capacity // self.size) for capacity in capacities))
+        self.ends = wp.zeros(self.number, dtype=wp.int32, device=device.warp)
+        self.smallest = wp.zeros(self.number, dtype=real.scalar, device=device.warp)
+        self.arrived = wp.zeros(1, dtype=wp.int32, device=device.warp)
+        self.grouped = filled(grouped(real), self)
 
 
 class Candidates:
@@ -259,7 +289,7 @@ class Candidates:
     Everything but `grow` only launches, so that it can be recorded. A list that is full is flagged in `overflow`, (1,) int32 on
     the device; what was listed is then incomplete, and the caller has to `grow` and list again.
     rest_separation: (n,) the part of its distance at rest that a pair of one body keeps at most, REST_SEPARATION where None.
-    flat: (bodies,) int32, 1 where the faces of a body are flat; see `flatten`. ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
+    capacity: of both lists together; groups: see `Groups`. flat: (bodies,) int32, 1 where the faces of a body are flat; see `flatten`. ignored: (quarantined,) vec2i, pairs of bodies in ascending order whose pairs are IGNORED, -1 for none; see `ignore`.
     needed: (1,) int32 on the device, what `check` writes; renewed: (1,) int32, whether it has asked for a list since somebody took that back. generation: grows whenever arrays were replaced.
     """
 
@@ -290,11 +320,13 @@ class Candidates:
         self.end = wp.zeros(n, dtype=real.vec3, device=device.warp)
         reach = (half_separation.numpy().astype(float) + (0.5 * activation_distance + margin)) * (1.0 + ROUNDING)
         self.reach = wp.array(reach, dtype=real.scalar, device=device.warp)
+        self._parts = Parts(device, n)
         self.away = wp.zeros(4, dtype=wp.int32, device=device.warp)
         self.needed, self.renewed = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(2))
         self.sieve = sieve.functions(real).Sieve()
         self.sieve.begin, self.sieve.end, self.sieve.reach = self.begin, self.end, self.reach
         self.overflow = broad_phase.overflow
+        self._reuse = filled(reuse(real), self)
         self.lists = [CandidateList(device, real, kind) for kind in ("vertex_triangle", "edge_edge")]
         self.vertex_triangle, self.edge_edge = self.lists
         self.generation = 0
@@ -305,7 +337,8 @@ class Candidates:
         for own, found in zip(self.lists, self.broad_phase.lists, strict=True):
             if self.generation == 0 or own.capacity != len(found.pairs):
                 own.allocate(found.count, len(found.pairs))
-        self.largest = Largest(self.device, self.real, [own.closest.size for own in self.lists])
+        capacities = [own.capacity for own in self.lists]
+        self.capacity, self.groups = sum(capacities), Groups(self.device, self.real, capacities)
         self.generation += 1
 
     def invalidate(self) -> None:
@@ -357,7 +390,5 @@ class Candidates:
 
         It does where all of x0 are near one end of the motion that the list was made for, and all of x1 near one end.
         """
-        k = self.kernels
-        inputs = [x0, x1, self.begin, self.end, self.real.scalar(self.margin), self.away]
-        self.device.launch(k.depart, len(x0), inputs)
-        self.device.launch_serial(k.decide, [self.away, self.overflow, self.needed, self.renewed])
+        parts = self._parts
+        self.device.launch_blocks(self.kernels.check, parts.number, [x0, x1, parts.share, self._reuse], grain=parts.size)

@@ -183,3 +183,19 @@ def vertex_triangle_distance(p: Vec3, a: Vec3, b: Vec3, c: Vec3) -> wide:
 def edge_edge_distance(a0: Vec3, a1: Vec3, b0: Vec3, b1: Vec3) -> wide:
     """Distance of two edges, in metres."""
     return origin_segment_distance(relative(a1, a0), relative(b0, a0), relative(b1, a0))
+
+
+@func
+def pair_weights(edges: bool, x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3) -> wide4:
+    """Of a pair of edges x0-x1 and x2-x3, or of a vertex and a triangle."""
+    if edges:
+        return edge_edge_weights(x0, x1, x2, x3)
+    return vertex_triangle_weights(x0, x1, x2, x3)
+
+
+@func
+def pair_distance(edges: bool, x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3) -> wide:
+    """Likewise, m."""
+    if edges:
+        return edge_edge_distance(x0, x1, x2, x3)
+    return vertex_triangle_distance(x0, x1, x2, x3)

@@ -28,7 +28,8 @@ import warp as wp
 
 from pdipc.collision import ccd, distance
 from pdipc.collision.candidates import Candidates, listed
-from pdipc.device.language import filled, kernel, struct_of
+from pdipc.device import atomic
+from pdipc.device.language import filled, func, kernel, struct_of
 from pdipc.device.launch import Device, Span
 from pdipc.device.precision import Real
 
@@ -54,134 +55,94 @@ def truncated(real: Real) -> Any:
         u_end=wp.array(dtype=real.vec3),
         x_end=wp.array(dtype=real.vec3),
         passes=wp.array(dtype=wp.int32),
-        going=wp.array(dtype=wp.int32),
     )
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, vec4, Truncated, Listed = real.scalar, real.vec3, real.vec4, truncated(real), listed(real)
+    scalar, vec2, vec3, vec4 = real.scalar, real.vec2, real.vec3, real.vec4
+    Truncated, Listed = truncated(real), listed(real)
     module = real.module(__name__)
     c = ccd.functions(real)
     unit = wp.constant(UNIT)
 
-    def sweep(kind: str):
-        edge_edge = kind == "edge_edge"
+    lower = atomic.lower()
 
-        @kernel(module, f"sweep_{kind}")
-        def sweep_pairs(
-            span: Span,
-            pairs: Listed,
-            x: wp.array(dtype=vec3),
-            t: Truncated,
-            body: wp.array(dtype=wp.int32),
-            time_out: wp.array(dtype=wp.int32),
-            hits_out: wp.array(dtype=wp.int32),
-            deep_out: wp.array(dtype=wp.int32),
-        ):
-            worker = span.first + wp.tid()
-            backoff = scalar(FIRST_BACKOFF)
-            if t.passes[0] > 0:
-                backoff = scalar(LATER_BACKOFF)
-            for begin in range(worker * span.block, pairs.count[0], span.step * span.block):
-                hits = int(0)
-                for k in range(begin, wp.min(begin + span.block, pairs.count[0])):
-                    q = pairs.quads[k]
-                    time = unit
-                    shortest = wp.min(wp.min(t.fraction[q[0]], t.fraction[q[1]]), wp.min(t.fraction[q[2]], t.fraction[q[3]]))
-                    if (t.passes[0] == 0 or shortest < scalar(1.0)) and pairs.limits[k][1] >= scalar(0.0):
-                        xi = pairs.limits[k][0]
-                        when = scalar(2.0)
-                        if wp.static(edge_edge):
-                            when = c.edge_edge(
-                                x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                                t.x_end[q[0]], t.x_end[q[1]], t.x_end[q[2]], t.x_end[q[3]], xi, backoff, pairs.limits[k][1],
-                            )  # fmt: skip
-                        else:
-                            when = c.vertex_triangle(
-                                x[q[0]], x[q[1]], x[q[2]], x[q[3]],
-                                t.x_end[q[0]], t.x_end[q[1]], t.x_end[q[2]], t.x_end[q[3]], xi, backoff, pairs.limits[k][1],
-                            )  # fmt: skip
-                        if when <= scalar(1.0):
-                            time = wp.int32(wp.floor(when * scalar(unit) * scalar(0.999999)))
-                            hits += 1
-                            apart = scalar(0.0)
-                            if wp.static(edge_edge):
-                                apart = scalar(distance.edge_edge_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                            else:
-                                apart = scalar(distance.vertex_triangle_distance(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                            if apart - xi < scalar(DEEP) * pairs.limits[k][1]:
-                                # whoever writes, writes the same
-                                if body[q[0]] >= 0:
-                                    deep_out[body[q[0]]] = 1
-                                if body[q[3]] >= 0:
-                                    deep_out[body[q[3]]] = 1
-                    time_out[k] = time
-                hits_out[begin // span.block] = hits
-
-        return sweep_pairs
-
-    @kernel(module)
-    def reset(
-        first: int,
-        groups: int,
-        multiplier_out: wp.array(dtype=wp.int32),
-        least_out: wp.array(dtype=wp.int32),
-        any_hit_out: wp.array(dtype=wp.int32),
+    @func
+    def withdraws(
+        edges: bool, q: wp.vec4i, x: wp.array(dtype=vec3), x_end: wp.array(dtype=vec3), rigid: wp.array(dtype=wp.int32)
     ):
-        i = first + wp.tid()
-        multiplier_out[i] = unit
-        if i < groups:
-            least_out[i] = unit
-        if i == 0:
-            any_hit_out[0] = 0
+        """Whether what is rigid in a pair goes away from the rest."""
+        a = vec4(distance.pair_weights(edges, x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
+        apart = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
+        away = scalar(0.0)
+        for s in range(4):
+            if rigid[q[s]] != 0:
+                away += a[s] * wp.dot(apart, x_end[q[s]] - x[q[s]])
+        return away >= scalar(0.0)
 
     @kernel(module)
-    def clear(first: int, values_out: wp.array(dtype=wp.int32)):
-        values_out[first + wp.tid()] = 0
-
-    def spread(kind: str):
-        edge_edge = kind == "edge_edge"
-
-        @kernel(module, f"spread_{kind}")
-        def spread_times(
-            span: Span,
-            pairs: Listed,
-            x: wp.array(dtype=vec3),
-            t: Truncated,
-            rigid: wp.array(dtype=wp.int32),
-            times: wp.array(dtype=wp.int32),
-            hits: wp.array(dtype=wp.int32),
-            multiplier: wp.array(dtype=wp.int32),
-            any_hit: wp.array(dtype=wp.int32),
-        ):
-            """The vertices of a pair that is hit are shortened; but an obstacle that withdraws is not held by what comes after it."""
-            worker = span.first + wp.tid()
-            for begin in range(worker * span.block, pairs.count[0], span.step * span.block):
-                if hits[begin // span.block] > 0:
-                    any_hit[0] = 1
-                    for k in range(begin, wp.min(begin + span.block, pairs.count[0])):
-                        if times[k] < unit:
-                            q = pairs.quads[k]
-                            withdraws = int(0)
-                            if t.passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
-                                a = vec4()
-                                if wp.static(edge_edge):
-                                    a = vec4(distance.edge_edge_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                                else:
-                                    a = vec4(distance.vertex_triangle_weights(x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
-                                apart = a[1] * (x[q[1]] - x[q[0]]) + a[2] * (x[q[2]] - x[q[0]]) + a[3] * (x[q[3]] - x[q[0]])
-                                away = scalar(0.0)
-                                for s in range(4):
-                                    if rigid[q[s]] != 0:
-                                        away += a[s] * wp.dot(apart, t.x_end[q[s]] - x[q[s]])
-                                if away >= scalar(0.0):
-                                    withdraws = 1
-                            for s in range(4):
-                                if withdraws == 0 or rigid[q[s]] == 0:
-                                    wp.atomic_min(multiplier, q[s], times[k])
-
-        return spread_times
+    def sweep(
+        span: Span,
+        points: Listed,
+        lines: Listed,
+        x: wp.array(dtype=vec3),
+        o: Truncated,
+        body: wp.array(dtype=wp.int32),
+        rigid: wp.array(dtype=wp.int32),
+        multiplier: wp.array(dtype=wp.int32),
+        any_hit_out: wp.array(dtype=wp.int32),
+        deep_out: wp.array(dtype=wp.int32),
+    ):
+        """CCD of all pairs, first those of a vertex and a triangle. The vertices of a pair that is hit are shortened; but an obstacle that withdraws is
+        not held by what comes after it. Flags: whoever writes, writes the same.
+        """
+        worker = span.first + wp.tid()
+        backoff = scalar(FIRST_BACKOFF)
+        if o.passes[0] > 0:
+            backoff = scalar(LATER_BACKOFF)
+        count = points.count[0] + lines.count[0]
+        if o.passes[0] > MAX_PASSES:
+            count = 0  # nobody moves
+        for begin in range(worker * span.block, count, span.step * span.block):
+            for k in range(begin, wp.min(begin + span.block, count)):
+                edges = k >= points.count[0]
+                q = wp.vec4i()
+                reach = vec2()
+                if edges:
+                    q = lines.quads[k - points.count[0]]
+                    reach = lines.limits[k - points.count[0]]
+                else:
+                    q = points.quads[k]
+                    reach = points.limits[k]
+                shortest = wp.min(wp.min(o.fraction[q[0]], o.fraction[q[1]]), wp.min(o.fraction[q[2]], o.fraction[q[3]]))
+                t = scalar(2.0)
+                if (o.passes[0] == 0 or shortest < scalar(1.0)) and reach[1] >= scalar(0.0):
+                    if edges:
+                        t = c.edge_edge(
+                            x[q[0]], x[q[1]], x[q[2]], x[q[3]],
+                            o.x_end[q[0]], o.x_end[q[1]], o.x_end[q[2]], o.x_end[q[3]], reach[0], backoff, reach[1],
+                        )  # fmt: skip
+                    else:
+                        t = c.vertex_triangle(
+                            x[q[0]], x[q[1]], x[q[2]], x[q[3]],
+                            o.x_end[q[0]], o.x_end[q[1]], o.x_end[q[2]], o.x_end[q[3]], reach[0], backoff, reach[1],
+                        )  # fmt: skip
+                if t <= scalar(1.0):
+                    any_hit_out[0] = 1
+                    time = wp.int32(wp.floor(t * scalar(unit) * scalar(0.999999)))
+                    apart = scalar(distance.pair_distance(edges, x[q[0]], x[q[1]], x[q[2]], x[q[3]]))
+                    if apart - reach[0] < scalar(DEEP) * reach[1]:
+                        if body[q[0]] >= 0:
+                            deep_out[body[q[0]]] = 1
+                        if body[q[3]] >= 0:
+                            deep_out[body[q[3]]] = 1
+                    held = bool(True)
+                    if o.passes[0] < STUBBORN and rigid[q[0]] != rigid[q[3]]:
+                        held = not withdraws(edges, q, x, o.x_end, rigid)
+                    for s in range(4):
+                        if held or rigid[q[s]] == 0:
+                            lower(multiplier, q[s], time)
 
     @kernel(module)
     def together(
@@ -226,11 +187,8 @@ def kernels(real: Real) -> SimpleNamespace:
             fraction[members[k]] = least
 
     @kernel(module)
-    def shorten(
-        first: int,
-        multiplier: wp.array(dtype=wp.int32),
-        t: Truncated,
-    ):
+    def shorten(first: int, multiplier: wp.array(dtype=wp.int32), t: Truncated):
+        """Clears the times for the next pass."""
         i = first + wp.tid()
         if multiplier[i] < unit:
             shrink = scalar(1.0)
@@ -243,6 +201,7 @@ def kernels(real: Real) -> SimpleNamespace:
             t.fraction[i] = f
             if t.passes[0] == 0:
                 t.first_fraction[i] = f
+            multiplier[i] = int(unit)
         if t.passes[0] >= MAX_PASSES:
             # nobody moves, which is always feasible
             t.fraction[i] = scalar(0.0)
@@ -272,47 +231,47 @@ def kernels(real: Real) -> SimpleNamespace:
     @kernel(module)
     def place(
         first: int,
+        groups: int,
         base: wp.array(dtype=vec3),
         u: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
         t: Truncated,
+        least_out: wp.array(dtype=wp.int32),
+        any_hit_out: wp.array(dtype=wp.int32),
     ):
+        """Where shortened vertices end; the next pass begins."""
         i = first + wp.tid()
         if t.fraction[i] < scalar(1.0):
             t.u_end[i] = u[i] + t.fraction[i] * (u_tilde[i] - u[i])
             t.x_end[i] = base[i] + t.u_end[i]
-
-    @kernel(module)
-    def decide(first: int, any_hit: wp.array(dtype=wp.int32), t: Truncated):
-        t.going[0] = 0
-        if any_hit[0] == 1:
-            if t.passes[0] < MAX_PASSES:
-                t.going[0] = 1
+        if i < groups:
+            least_out[i] = unit
+        if i == 0:
             t.passes[0] = t.passes[0] + 1
+            any_hit_out[0] = 0
 
     @kernel(module)
-    def begin_pass(
+    def begin(
         first: int,
+        bodies: int,
         base: wp.array(dtype=vec3),
         u_tilde: wp.array(dtype=vec3),
         t_out: Truncated,
+        deep_out: wp.array(dtype=wp.int32),
     ):
+        """The whole motion."""
         i = first + wp.tid()
         t_out.fraction[i] = scalar(1.0)
         t_out.first_fraction[i] = scalar(1.0)
         t_out.u_end[i] = u_tilde[i]
         t_out.x_end[i] = base[i] + u_tilde[i]
+        if i < bodies:
+            deep_out[i] = 0
         if i == 0:
             t_out.passes[0] = 0
-            t_out.going[0] = 1
 
     return SimpleNamespace(
-        sweep_vertex_triangle=sweep("vertex_triangle"),
-        sweep_edge_edge=sweep("edge_edge"),
-        reset=reset,
-        clear=clear,
-        spread_vertex_triangle=spread("vertex_triangle"),
-        spread_edge_edge=spread("edge_edge"),
+        sweep=sweep,
         together=together,
         find_least=find_least,
         spread_least=spread_least,
@@ -320,8 +279,7 @@ def kernels(real: Real) -> SimpleNamespace:
         shorten=shorten,
         grade=grade,
         place=place,
-        decide=decide,
-        begin_pass=begin_pass,
+        begin=begin,
     )
 
 
@@ -338,7 +296,7 @@ class Truncation:
     def __init__(self, device: Device, real: Real, n: int, per_vertex: bool = True, bodies: Sequence[np.ndarray] = ()):
         self.device, self.real, self.n, self.per_vertex = device, real, n, per_vertex
         self.kernels = kernels(real)
-        self.multiplier = wp.zeros(n, dtype=wp.int32, device=device.warp)
+        self.multiplier = wp.full(n, UNIT, dtype=wp.int32, device=device.warp)
         self.fraction, self.first_fraction = (wp.zeros(n, dtype=real.scalar, device=device.warp) for _ in range(2))
         self.u_end, self.x_end = (wp.zeros(n, dtype=real.vec3, device=device.warp) for _ in range(2))
         self.body_count = 0
@@ -348,7 +306,7 @@ class Truncation:
         self.graded = wp.zeros(n, dtype=real.scalar, device=device.warp)
         self.bodies = list(bodies)
         self.keep_rigid([])
-        self.passes, self.any_hit, self.going = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(3))
+        self.passes, self.any_hit = (wp.zeros(1, dtype=wp.int32, device=device.warp) for _ in range(2))
         self.truncated = filled(truncated(real), self)
 
     def keep_rigid(self, groups: list[np.ndarray]) -> None:
@@ -367,33 +325,26 @@ class Truncation:
         for group, vertices in enumerate(groups):
             group_of[vertices] = group
         self.group_of = wp.array(group_of, device=self.device.warp)
-        self.least = wp.zeros(max(1, len(groups)), dtype=wp.int32, device=self.device.warp)
+        self.least = wp.full(max(1, len(groups)), UNIT, dtype=wp.int32, device=self.device.warp)
 
     def truncate(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
         """Fills u_end, x_end = base + u_end and `passes`, the number of passes that found hits: 0 where the whole motion is free.
 
         base: (n,) m, positions at the start of the step; u and u_tilde: displacements from there; x = base + u. Recordable.
         """
-        if self.body_count:
-            self.device.launch(self.kernels.clear, self.body_count, [self.deep])
-        self.device.launch(self.kernels.begin_pass, self.n, [base, u_tilde, self.truncated])
+        self.device.launch(self.kernels.begin, self.n, [self.body_count, base, u_tilde, self.truncated, self.deep])
         self.prove(candidates, base, u, u_tilde, x)
 
     def prove(self, candidates: Candidates, base: wp.array, u: wp.array, u_tilde: wp.array, x: wp.array) -> None:
-        """The passes over the motion x -> x_end, with `fraction`, `u_end` and `x_end` as they are; `going` and `passes` say where to begin:
+        """The passes over the motion x -> x_end, with `fraction`, `u_end` and `x_end` as they are; `passes` says where to begin:
         0 with all pairs, more with those of shortened vertices. Recordable.
         """
         k, device, n = self.kernels, self.device, self.n
 
         def sweep() -> None:
-            device.launch(k.reset, n, [self.group_count, self.multiplier, self.least, self.any_hit])
-            for c in candidates.lists:
-                inputs = [c.listed, x, self.truncated, self.body, c.times, c.found, self.deep]
-                device.launch_list(getattr(k, f"sweep_{c.kind}"), c.capacity, inputs)
-                inputs = [c.listed, x, self.truncated, self.rigid, c.times, c.found, self.multiplier, self.any_hit]
-                device.launch_scatter(getattr(k, f"spread_{c.kind}"), c.capacity, inputs)
-            device.when(self.any_hit, shorten)
-            device.launch_serial(k.decide, [self.any_hit, self.truncated])
+            pairs = [each.listed for each in candidates.lists]
+            inputs = [*pairs, x, self.truncated, self.body, self.rigid, self.multiplier, self.any_hit, self.deep]
+            device.launch_list(k.sweep, candidates.capacity, inputs)
 
         def shorten() -> None:
             if self.group_count and device.wide:
@@ -408,8 +359,10 @@ class Truncation:
                         device.launch(k.grade, n, [*self.neighbours, x, u, u_tilde, before, after], grain=16)
                 if self.bodies:
                     device.launch(k.level, self.group_count, [self.group_ends, self.group_members, self.fraction])
-            device.launch(k.place, n, [base, u, u_tilde, self.truncated])
+            device.launch(k.place, n, [self.group_count, base, u, u_tilde, self.truncated, self.least, self.any_hit])
             candidates.check(x, self.x_end)  # shortened vertices no longer move along with their neighbours
             device.when(candidates.needed, lambda: candidates.cover(x, self.x_end))
+            sweep()
 
-        device.loop(self.going, sweep)
+        sweep()
+        device.loop(self.any_hit, shorten)

@@ -2,6 +2,7 @@
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -29,7 +30,7 @@ from pdipc.constraints import (
     woven_bending,
 )
 from pdipc.constraints.base import ConstraintSet, merge
-from pdipc.device.language import kernel
+from pdipc.device.language import func, kernel, struct_of
 from pdipc.device.launch import Device, Reducer
 from pdipc.device.precision import Real
 from pdipc.device.precision import real as real_of
@@ -59,29 +60,39 @@ KINDS = (
 
 
 @functools.cache
+def corners(real: Real) -> Any:
+    """A struct: what elements do to their corners, and where each vertex finds its own."""
+    return struct_of(
+        "Corners",
+        __name__,
+        offsets=wp.array(dtype=wp.int32),
+        slots=wp.array(dtype=wp.int32),
+        forces=wp.array(dtype=real.vec3),  # N
+    )
+
+
+@functools.cache
 def kernels_of(real: Real) -> SimpleNamespace:
-    scalar, vec3 = real.scalar, real.vec3
+    scalar, vec3, Corners = real.scalar, real.vec3, corners(real)
+
+    @func
+    def total(i: int, force: vec3, o: Corners) -> vec3:
+        """A force on vertex i, and what its elements add to it."""
+        whole = force
+        for k in range(o.offsets[i], o.offsets[i + 1]):
+            whole += o.forces[o.slots[k]]
+        return whole
 
     @kernel(real.module(__name__))
-    def gather(
-        first: int,
-        base: wp.array(dtype=vec3),
-        offsets: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
-        corners: wp.array(dtype=vec3),
-        sum_out: wp.array(dtype=vec3),
-    ):
+    def gather(first: int, force: wp.array(dtype=vec3), o: Corners, force_out: wp.array(dtype=vec3)):
         i = first + wp.tid()
-        total = base[i]
-        for k in range(offsets[i], offsets[i + 1]):
-            total += corners[slots[k]]
-        sum_out[i] = total
+        force_out[i] = total(i, force[i], o)
 
     @kernel(real.module(__name__))
     def store(first: int, total: wp.array(dtype=wp.float64), slot: int, out: wp.array(dtype=real.scalar)):
         out[slot] = scalar(total[0])
 
-    return SimpleNamespace(gather=gather, store=store)
+    return SimpleNamespace(total=total, gather=gather, store=store)
 
 
 class Projector:
@@ -93,6 +104,7 @@ class Projector:
     rails: likewise of attachments along some axes, and rail_hessian, what they add to Newton's matrix. threads: the lengths of stitches, (k,), or None; assign to it to sew.
     cavities: what closed sheets hold, or None; a part of the Newton matrix as well.
     energies: (count,) float64 on the device, J, in the order of the elements; what `evaluate` fills.
+    corners: the forces of elements on their corners, as kernels read them; what `find_forces` fills.
     blocks: 3x3 blocks on the device, what `differentiate` fills: for each element of `bending` those of its corners a <= b, row by row;
     only a < b need be filled, since rows add up to zero.
     """
@@ -142,6 +154,8 @@ class Projector:
         self._offsets = wp.array(offsets, device=device.warp)
         self._slots = wp.array(np.append(order, 0).astype(np.int32), device=device.warp)
         self._corners = wp.zeros(max(1, slot), dtype=real.vec3, device=device.warp)
+        self.corners = corners(real)()
+        self.corners.offsets, self.corners.slots, self.corners.forces = self._offsets, self._slots, self._corners
         self.energies = wp.zeros(max(1, element), dtype=wp.float64, device=device.warp)
         self.block_count = block
         self._kernels = kernels_of(real)
@@ -158,11 +172,15 @@ class Projector:
 
         Every corner writes to a place of its own and every vertex gathers its own: no atomics. Recordable.
         """
+        self.find_forces(base, u)
+        self.device.launch(self._kernels.gather, self.n, [force, self.corners, force_out], grain=8)
+
+    def find_forces(self, base: wp.array, u: wp.array) -> None:
+        """Fills `corners` with the forces of `add_forces`, for who adds them up. Recordable."""
         if self.cavities is not None:
             self.cavities.measure(base, u)
         for kind, count, arrays, slot, _, _ in self._batches:
             self.device.launch(kind.force, count, [*arrays, base, u, slot, self._corners], grain=16)
-        self.device.launch(self._kernels.gather, self.n, [force, self._offsets, self._slots, self._corners, force_out], grain=8)
 
     def evaluate(self, base: wp.array, u: wp.array) -> None:
         """Fills `energies` at x = base + u. Recordable."""

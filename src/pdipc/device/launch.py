@@ -30,7 +30,7 @@ import warp as wp
 
 from pdipc.device import blocks, system
 from pdipc.device import threads as shared
-from pdipc.device.language import Kernel, func, kernel, struct
+from pdipc.device.language import Kernel, filled, func, kernel, struct
 from pdipc.device.precision import Real
 from pdipc.device.threads import one_at_a_time as one_at_a_time
 
@@ -170,6 +170,7 @@ class Device:
         self.block = CUDA_BLOCK if self.is_cuda else CPU_BLOCK  # list entries of a span's block
         self._recording: int | None = None  # the CPU thread whose graph is being recorded
         self._meeting = None if self.is_cuda else wp.zeros(system.MEETING, dtype=wp.int32, device=self.warp)
+        self._scanned = wp.zeros(1, dtype=wp.int32, device=self.warp)  # see `scan`
         self._process = shared.process
 
     @functools.cached_property
@@ -285,10 +286,8 @@ class Device:
         On CUDA by kernels of our own: Warp's scan allocates memory, which CUDA refuses inside the loops of a graph.
         """
         if self.wide:
-            n = counts.size
-            k = scan_kernels()
-            self.launch_blocks(k.scan_blocks, -(-n // BLOCK), [n, counts, ends_out])
-            self.launch_blocks(k.scan_ends, 1, [n, ends_out])
+            n, k = counts.size, scan_kernels()
+            self.launch_blocks(k.scan, -(-n // BLOCK), [n, counts, self._scanned, ends_out])
             self.launch(k.add_ends, n, [BLOCK, ends_out])
         else:
             self.once(lambda: wp.utils.array_scan(counts, ends_out, inclusive=True))
@@ -334,39 +333,42 @@ def _span(first: int, step: int, block: int) -> Any:
 
 @functools.cache
 def scan_kernels() -> SimpleNamespace:
-    """Inclusive sums in place of an array: within blocks, over the ends of blocks, then ends are added to the blocks after them.
+    """Inclusive sums in place of an array: within blocks and, by who is last, over the ends of blocks; then ends are added to the blocks after them.
 
-    The last number of each block is final after the second kernel, so no other memory is needed.
+    The last number of each block is final after the first kernel, so no other memory is needed.
     """
     module = wp.get_module(f"{__name__}.scan")
     module.options["enable_backward"] = False
+    block_scan, block_total, last_block = blocks.scan(), blocks.total(wp.int32), blocks.last()
 
     @kernel(module)
-    def scan_blocks(first: int, count: int, counts: wp.array(dtype=wp.int32), ends_out: wp.array(dtype=wp.int32)):
+    def scan(
+        first: int,
+        count: int,
+        counts: wp.array(dtype=wp.int32),
+        arrived: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+    ):
         i = first + wp.tid()
+        size = wp.block_dim()
+        lane = i % size
         value = int(0)
         if i < count:
             value = counts[i]
-        total = wp.untile(wp.tile_scan_inclusive(wp.tile(value)))
+        total = block_scan(value)
         if i < count:
-            ends_out[i] = total
-
-    @kernel(module)
-    def scan_ends(first: int, count: int, ends: wp.array(dtype=wp.int32)):
-        """Runs in one block of threads."""
-        lane = first + wp.tid()
-        size = wp.block_dim()
-        before = int(0)
-        for begin in range(0, count, size * size):
-            last = begin + (lane + 1) * size - 1
-            value = int(0)
-            if last < count:
-                value = ends[last]
-            values = wp.tile(value)
-            total = before + wp.untile(wp.tile_scan_inclusive(values))
-            if last < count:
-                ends[last] = total
-            before += wp.tile_extract(wp.tile_sum(values), 0)
+            ends[i] = total
+        if last_block(arrived, 0, (count + size - 1) // size):
+            before = int(0)
+            for begin in range(0, count, size * size):
+                end = begin + (lane + 1) * size - 1
+                value = int(0)
+                if end < count:
+                    value = ends[end]
+                total = before + block_scan(value)
+                if end < count:
+                    ends[end] = total
+                before += block_total(value)
 
     @kernel(module)
     def add_ends(first: int, size: int, ends: wp.array(dtype=wp.int32)):
@@ -374,31 +376,15 @@ def scan_kernels() -> SimpleNamespace:
         if i >= size and i % size != size - 1:
             ends[i] = ends[i] + ends[i // size * size - 1]
 
-    return SimpleNamespace(scan_blocks=scan_blocks, scan_ends=scan_ends, add_ends=add_ends)
+    return SimpleNamespace(scan=scan, add_ends=add_ends)
 
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    """Sums and largest values that do not depend on the number of threads: fixed blocks, then one worker, or block, over the blocks."""
+    """Sums and largest values that do not depend on the number of threads: of fixed parts, then, by who is last, over the parts."""
     scalar = real.scalar
     module = real.module(__name__)
-    block = wp.constant(REDUCE_BLOCK)
-    block_total, block_largest = blocks.total(scalar), blocks.largest(scalar)
-
-    @kernel(module)
-    def sum_blocks(first: int, values: wp.array(dtype=scalar), count: int, partial_out: wp.array(dtype=scalar)):
-        b = first + wp.tid()
-        total = scalar(0.0)
-        for i in range(b * block, wp.min((b + 1) * block, count)):
-            total += values[i]
-        partial_out[b] = total
-
-    @kernel(module)
-    def sum_partials(first: int, partial: wp.array(dtype=scalar), slots: int, out: wp.array(dtype=scalar), slot: int):
-        total = scalar(0.0)
-        for b in range(slots):
-            total += partial[b]
-        out[slot] = total
+    block_total, block_largest, last_block = blocks.total(scalar), blocks.largest(scalar), blocks.last()
 
     @func
     def one_of(which: int, i: int, a: wp.array(dtype=scalar), b: wp.array(dtype=scalar), c: wp.array(dtype=scalar)):
@@ -412,101 +398,120 @@ def kernels(real: Real) -> SimpleNamespace:
         return value
 
     @kernel(module)
-    def max_parts(
+    def find_largest(
         first: int,
         a: wp.array(dtype=scalar),
         b: wp.array(dtype=scalar),
         c: wp.array(dtype=scalar),
         counts: wp.vec3i,
-        blocks: int,
-        part: int,
-        partial_out: wp.array(dtype=scalar),
+        parts: Share,
+        slots: wp.vec3i,
+        partial: wp.array(dtype=scalar),
+        out: wp.array(dtype=scalar),
     ):
-        """Largest values of `part` numbers a block of threads, of which each array has so many blocks."""
+        """A block of threads a part of the numbers, of which each array has so many."""
         worker = first + wp.tid()
         block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        which = block // blocks
-        begin = wp.min((block - which * blocks) * part, counts[which] - 1)
+        which = block // parts.number
+        begin = wp.min((block - which * parts.number) * parts.size, counts[which] - 1)
         largest = one_of(which, begin, a, b, c)
-        for i in range(begin + lane, wp.min(begin + part, counts[which]), wp.block_dim()):
+        for i in range(begin + lane, wp.min(begin + parts.size, counts[which]), wp.block_dim()):
             largest = wp.max(largest, one_of(which, i, a, b, c))
         largest = block_largest(largest)
         if lane == 0:
-            partial_out[block] = largest
+            partial[block] = largest
+        if last_block(parts.arrived, which, parts.number):
+            largest = partial[which * parts.number]
+            for k in range(lane, parts.number, wp.block_dim()):
+                largest = wp.max(largest, partial[which * parts.number + k])
+            largest = block_largest(largest)
+            if lane == 0:
+                out[slots[which]] = largest
 
     @kernel(module)
-    def max_of_parts(first: int, partial: wp.array(dtype=scalar), blocks: int, slots: wp.vec3i, out: wp.array(dtype=scalar)):
-        """A block of threads for each array."""
+    def add_up(
+        first: int,
+        values: wp.array(dtype=scalar),
+        count: int,
+        parts: Share,
+        slot: int,
+        partial: wp.array(dtype=scalar),
+        out: wp.array(dtype=scalar),
+    ):
+        """A block of threads a part of the numbers."""
         worker = first + wp.tid()
-        which = worker // wp.block_dim()
+        block = worker // wp.block_dim()
         lane = worker % wp.block_dim()
-        largest = partial[which * blocks]
-        for k in range(lane, blocks, wp.block_dim()):
-            largest = wp.max(largest, partial[which * blocks + k])
-        largest = block_largest(largest)
-        if lane == 0:
-            out[slots[which]] = largest
-
-    @kernel(module)
-    def wide_sum(first: int, values: wp.array(dtype=scalar), count: int, stride: int, out: wp.array(dtype=scalar), slot: int):
-        """Sums of every `stride`-th number from that of the thread on, by block."""
-        worker = first + wp.tid()
         total = scalar(0.0)
-        for i in range(worker, count, stride):
+        for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, count), wp.block_dim()):
             total += values[i]
         total = block_total(total)
-        if worker % wp.block_dim() == 0:
-            out[slot + worker // wp.block_dim()] = total
+        if lane == 0:
+            partial[block] = total
+        if last_block(parts.arrived, 0, parts.number):
+            total = scalar(0.0)
+            for k in range(lane, parts.number, wp.block_dim()):
+                total += partial[k]
+            total = block_total(total)
+            if lane == 0:
+                out[slot] = total
 
-    return SimpleNamespace(
-        sum_blocks=sum_blocks,
-        sum_partials=sum_partials,
-        max_parts=max_parts,
-        max_of_parts=max_of_parts,
-        wide_sum=wide_sum,
-    )
+    return SimpleNamespace(find_largest=find_largest, add_up=add_up)
+
+
+@struct
+class Share:
+    """`Parts` as kernels take them."""
+
+    number: int
+    size: int
+    arrived: wp.array[wp.int32]
+
+
+class Parts:
+    """How `count` entries are cut for blocks of threads that finish together: `number` parts of `size` entries.
+
+    arrived: int32 on the device, the counters of `blocks.last`, of so many `slots`. share: these as kernels take them.
+    """
+
+    def __init__(self, device: Device, count: int, slots: int = 1):
+        self.size = max(REDUCE_BLOCK, -(-count // WIDE_BLOCKS)) if device.wide else REDUCE_BLOCK
+        self.number = max(1, -(-count // self.size))
+        self.arrived = wp.zeros(slots, dtype=wp.int32, device=device.warp)
+        self.share = filled(Share, self)
 
 
 class Largest:
-    """The largest numbers of up to three arrays on the device, in two launches. counts: how many numbers each has."""
+    """The largest numbers of up to three arrays on the device, in one launch. counts: how many numbers each has."""
 
     def __init__(self, device: Device, real: Real, counts: Sequence[int]):
         self.device, self.kernels, self.arrays = device, kernels(real), len(counts)
         self.counts = wp.vec3i(*counts, *([1] * (3 - len(counts))))
-        self.part = max(REDUCE_BLOCK, -(-max(counts) // WIDE_BLOCKS)) if device.wide else REDUCE_BLOCK
-        self.blocks = max(1, -(-max(counts) // self.part))
-        self.partial = wp.zeros(self.arrays * self.blocks, dtype=real.scalar, device=device.warp)
+        self.parts = Parts(device, max(counts), self.arrays)
+        self.partial = wp.zeros(self.arrays * self.parts.number, dtype=real.scalar, device=device.warp)
 
     def find(self, values: Sequence[wp.array], out: wp.array, slots: Sequence[int]) -> None:
         """Launches out[slots[k]] = largest of values[k]."""
-        k, device, fill = self.kernels, self.device, 3 - self.arrays
-        inputs = [*values, *[values[0]] * fill, self.counts, self.blocks, self.part, self.partial]
-        device.launch_blocks(k.max_parts, self.arrays * self.blocks, inputs, grain=REDUCE_BLOCK // 8)
-        inputs = [self.partial, self.blocks, wp.vec3i(*slots, *[0] * fill), out]
-        device.launch_blocks(k.max_of_parts, self.arrays, inputs, grain=1)
+        parts, fill = self.parts, 3 - self.arrays
+        inputs = [*values, *[values[0]] * fill, self.counts, parts.share, wp.vec3i(*slots, *[0] * fill), self.partial, out]
+        self.device.launch_blocks(self.kernels.find_largest, self.arrays * parts.number, inputs, grain=REDUCE_BLOCK // 8)
 
 
 class Reducer:
     """Adds up, or takes the largest of, `count` numbers in an array on the device; the result stays on the device."""
 
     def __init__(self, device: Device, real: Real, count: int):
-        self.device, self.count = device, count
-        self.blocks = min(WIDE_BLOCKS, max(1, -(-count // BLOCK))) if device.wide else max(1, -(-count // REDUCE_BLOCK))
-        self.partial = wp.zeros(self.blocks, dtype=real.scalar, device=device.warp)
-        self.kernels = kernels(real)
+        self.device, self.count, self.kernels = device, count, kernels(real)
+        self.parts = Parts(device, count)
+        self.partial = wp.zeros(self.parts.number, dtype=real.scalar, device=device.warp)
         self._largest = Largest(device, real, [count])
 
     def sum(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = sum of values[0:count], always in the same order on a device."""
-        k, device = self.kernels, self.device
-        if device.wide:
-            many = self.blocks * BLOCK
-            device.launch_blocks(k.wide_sum, self.blocks, [values, self.count, many, self.partial, 0])
-            device.launch_blocks(k.wide_sum, 1, [self.partial, self.blocks, BLOCK, out, slot])
-        else:
-            device.launch(k.sum_blocks, self.blocks, [values, self.count, self.partial], grain=REDUCE_BLOCK // 8)
-            device.launch_serial(k.sum_partials, [self.partial, self.blocks, out, slot])
+        parts = self.parts
+        inputs = [values, self.count, parts.share, slot, self.partial, out]
+        self.device.launch_blocks(self.kernels.add_up, parts.number, inputs, grain=REDUCE_BLOCK // 8)
 
     def max(self, values: wp.array, out: wp.array, slot: int = 0) -> None:
         """out[slot] = largest of values[0:count]."""

@@ -147,7 +147,7 @@ def kernels(real: Real) -> SimpleNamespace:
         report_out[CHORDS] = wp.float64(chords[0])
         report_out[GAP] = wp.float64(wp.inf)
         if progress.count[status.BARRIERS] > 0:
-            report_out[GAP] = -wp.float64(wp.max(closest[0], closest[1]))
+            report_out[GAP] = wp.float64(closest[0])
         for i in range(status.NUMBERS):
             report_out[FIRST_NUMBER + i] = wp.float64(progress.numbers[i])
         for stage in range(status.STARTED):

@@ -212,6 +212,7 @@ def kernels(real: Real) -> SimpleNamespace:
                     flags_out[WILL] = 1
             o.drive[m] = goes
             o.tries[m] = o.tries[m] + goes
+            o.behind[m] = 0  # for the next time
             chords_out[0] = wp.max(chords_out[0], o.at[m])
 
     return SimpleNamespace(begin=begin, aim=aim, clear=clear, compare=compare, hold=hold, advance=advance)
@@ -576,7 +577,6 @@ class Script:
         if not self.movers:
             return
         k, device = self.kernels, self.device
-        device.launch(k.clear, len(self.movers), [self.behind])
         device.launch(k.compare, self.member_count, [self.members, self.mover, x_start, self.target, u, self.behind])
         limits = [fraction, progress, self.patience, self.count]
         device.launch_serial(k.advance, [len(self.movers), self.leaders, *limits, self.march, self.flags, self.chords])

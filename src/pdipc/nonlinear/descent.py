@@ -24,7 +24,7 @@ from pdipc.collision.islands import Groups, Islands
 from pdipc.collision.truncation import truncated
 from pdipc.device import blocks
 from pdipc.device.language import filled, func, kernel, struct, struct_of
-from pdipc.device.launch import Largest
+from pdipc.device.launch import Largest, Parts, Share
 from pdipc.device.precision import Real
 from pdipc.device.sums import BodySums
 from pdipc.integration import inertia as implicit
@@ -56,6 +56,7 @@ TIES = (
     "surface_attachment",
     "stitch",
 )  # kinds of elements whose forces act on a body from outside
+KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 EXACT = 0.1  # of its length: what a step of a projected Hessian must be shorter by, to be believed
 PCG_PART = 0.05  # of the tolerance: an error of the linear solve that does not matter
 
@@ -108,7 +109,8 @@ class Search:
     """How the line search of an outer iteration stands. Arrays of one entry but those of bodies."""
 
     hits: wp.array[wp.int32]  # passes of truncation that found hits
-    attempts: wp.array[wp.int32]  # lengths that were tried
+    attempts: wp.array[wp.int32]  # lengths that were tried; 0 between iterations
+    whole: wp.array[wp.int32]  # whether the last iteration went its whole way
     searching: wp.array[wp.int32]  # whether another one is to be tried
     lowered: wp.array[wp.int32]  # whether the potential of any island has fallen by more than rounding
     accepted: wp.array[wp.int32]  # of bodies, whether their island is done
@@ -175,7 +177,7 @@ def kernels(real: Real) -> SimpleNamespace:
     module = real.module(__name__)
     wide = wp.float64
     slack = wp.constant(wp.float64(SLACK[real.name]))
-    least_number = blocks.least(scalar)
+    least_number, largest_number, last_block = blocks.least(scalar), blocks.largest(scalar), blocks.last()
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
 
     @kernel(module)
@@ -200,6 +202,7 @@ def kernels(real: Real) -> SimpleNamespace:
         islands: Groups,
         deep: wp.array(dtype=wp.int32),
         e: Energies,
+        passes: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
         negligible: wide,
         search: Search,
@@ -207,6 +210,8 @@ def kernels(real: Real) -> SimpleNamespace:
         """Whether the potential of each island has not risen. What was squeezed before is not squeezed again while the rest goes on: such an
         island goes back as a whole.
         """
+        if search.attempts[0] == 0:
+            search.hits[0] = passes[0]
         for b in range(islands.count):
             e.before[b] = wide(0.0)
             e.after[b] = wide(0.0)
@@ -293,7 +298,6 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         if i == 0:
             t.passes[0] = 1  # what is not shortened has been proven already
-            t.going[0] = 1
         b = islands.body[i]
         if b >= 0 and search.accepted[wp.max(b, 0)] == 0:
             f = least[islands.label[b]]
@@ -313,23 +317,36 @@ def kernels(real: Real) -> SimpleNamespace:
     def commit(
         first: int,
         overflow: wp.array(dtype=wp.int32),
-        base: wp.array(dtype=vec3),
+        o: Motion,
         goal: wp.array(dtype=vec3),
         free: wp.array(dtype=scalar),
-        u_end: wp.array(dtype=vec3),
-        x_end: wp.array(dtype=vec3),
-        u_out: wp.array(dtype=vec3),
+        t: Truncated,
+        parts: Share,
+        partial: wp.array(dtype=scalar),
         x_out: wp.array(dtype=vec3),
-        lag_out: wp.array(dtype=scalar),
+        numbers_out: wp.array(dtype=scalar),
     ):
-        """The motion is made. lag: how far a scripted vertex is from its goal, m."""
-        i = first + wp.tid()
-        lag_out[i] = scalar(0.0)
+        """The motion is made, by blocks of threads; and how far the last vertex that is scripted is from its goal, m."""
+        worker = first + wp.tid()
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        lag = scalar(0.0)
         if overflow[0] == 0:
-            u_out[i] = u_end[i]
-            x_out[i] = x_end[i]
-            if free[i] == scalar(0.0):
-                lag_out[i] = wp.length((goal[i] - base[i]) - u_end[i])
+            for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, free.shape[0]), wp.block_dim()):
+                o.u[i] = t.u_end[i]
+                x_out[i] = t.x_end[i]
+                if free[i] == scalar(0.0):
+                    lag = wp.max(lag, wp.length((goal[i] - o.base[i]) - t.u_end[i]))
+        lag = largest_number(lag)
+        if lane == 0:
+            partial[block] = lag
+        if last_block(parts.arrived, 0, parts.number):
+            lag = scalar(0.0)
+            for k in range(lane, parts.number, wp.block_dim()):
+                lag = wp.max(lag, partial[k])
+            lag = largest_number(lag)
+            if lane == 0:
+                numbers_out[status.LAG] = lag
 
     @kernel(module)
     def commit_energies(
@@ -437,30 +454,63 @@ def kernels(real: Real) -> SimpleNamespace:
         first: int,
         bodies: int,
         restraint_out: wp.array(dtype=scalar),
-        restrained_out: wp.array(dtype=wp.int32),
-        squeezed_out: wp.array(dtype=wp.int32),
+        renew_out: wp.array(dtype=wp.int32),
+        search_out: Search,
     ):
         for b in range(bodies):
             restraint_out[b] = scalar(0.0)
-            squeezed_out[b] = 0
-        restrained_out[0] = 0
+            search_out.squeezed[b] = 0
+        search_out.restrained[0] = 0
+        search_out.attempts[0] = 0
+        search_out.whole[0] = 0
+        if renew_out:
+            renew_out[0] = 1
+            search_out.project[0] = 1
 
-    @kernel(module)
-    def before_search(
-        first: int,
-        passes: wp.array(dtype=wp.int32),
-        hits_out: wp.array(dtype=wp.int32),
-        attempts_out: wp.array(dtype=wp.int32),
-        count_out: wp.array(dtype=wp.int32),
-    ):
-        hits_out[0] = passes[0]
-        attempts_out[0] = 0
-        count_out[status.MOVING] = 0
+    @func
+    def restrain(islands: Groups, search: Search, least: wp.array(dtype=scalar), restraint: wp.array(dtype=scalar)) -> int:
+        """By how many times its inertia each body is held back, as in the method of Levenberg and Marquardt; returns whether any is.
+
+        Newton's step doubles a tiny gap, if it is made whole. But what slides past such a gap hits it at once, and an island that is shortened by
+        that makes no way, and squeezes the gap further. Inertia shortens the sliding and leaves the opening, which is stiff, as it is.
+        """
+        restrained = int(0)
+        for b in range(islands.count):
+            island = islands.label[b]
+            r = scalar(RELEASE) * restraint[b]
+            if r < scalar(RELEASED):
+                r = scalar(0.0)
+            if (
+                search.squeezed[island] != 0
+                and search.attempts[0] > 1
+                and least[island] < scalar(RESTRAIN)
+                and islands.driven[b] == 0
+            ):
+                r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
+                r = wp.min(r, scalar(MOST_RESTRAINT))
+            restraint[b] = r
+            if r > scalar(0.0):
+                restrained = 1
+        return restrained
+
+    @func
+    def choose(search: Search, moved: scalar, tolerance: scalar, renew: wp.array(dtype=wp.int32)):
+        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads. Elastic
+        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last, and they
+        are exact: a projected one, or one from where a body was stretched by what rotated it, is too stiff to tell how much is left.
+        """
+        was_projected = search.project[0] != 0
+        search.project[0] = 1
+        anew = int(1)
+        if search.whole[0] != 0:
+            search.project[0] = 0
+            if renew[0] == 1 and not was_projected and moved <= scalar(KEEP) * tolerance:
+                anew = int(0)
+        renew[0] = anew
 
     # Long: one decision, of all that was found out in an iteration.
-    @kernel(module)
-    def decide(
-        first: int,
+    @func
+    def conclude(
         pairs: wp.array(dtype=wp.int32),
         script: wp.array(dtype=wp.int32),
         overflow: wp.array(dtype=wp.int32),
@@ -543,6 +593,37 @@ def kernels(real: Real) -> SimpleNamespace:
         if code == status.RUNNING:
             progress.going[0] = 1
 
+    # Arguments: all that an iteration hands on to the next, in one launch.
+    @kernel(module)
+    def decide(
+        first: int,
+        pairs: wp.array(dtype=wp.int32),
+        script: wp.array(dtype=wp.int32),
+        overflow: wp.array(dtype=wp.int32),
+        search: Search,
+        limits: Limits,
+        progress: Progress,
+        islands: Groups,
+        e: Energies,
+        least: wp.array(dtype=scalar),
+        restraint: wp.array(dtype=scalar),
+        renew: wp.array(dtype=wp.int32),
+    ):
+        """Whether to go on, and with what: who is held back, the potential to compare the next with and, where `renew` is given, which Hessian and
+        whether it is made anew.
+        """
+        conclude(pairs, script, overflow, search, limits, progress)
+        search.restrained[0] = restrain(islands, search, least, restraint)
+        for b in range(islands.count):
+            e.base_old[b] = e.base_new[b]
+        search.whole[0] = 0
+        if progress.count[status.OUTER] > 0 and search.hits[0] == 0 and search.attempts[0] == 1:
+            search.whole[0] = 1
+        if renew:
+            choose(search, progress.numbers[status.MOVED], limits.tolerance, renew)
+        search.attempts[0] = 0
+        progress.count[status.MOVING] = 0
+
     @kernel(module)
     def note_motion(
         first: int,
@@ -554,38 +635,6 @@ def kernels(real: Real) -> SimpleNamespace:
         i = first + wp.tid()
         if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
             count[status.MOVING] = 1
-
-    @kernel(module)
-    def restrain(
-        first: int,
-        islands: Groups,
-        search: Search,
-        least: wp.array(dtype=scalar),
-        restraint: wp.array(dtype=scalar),
-    ):
-        """By how many times its inertia each body is held back, as in the method of Levenberg and Marquardt.
-
-        Newton's step doubles a tiny gap, if it is made whole. But what slides past such a gap hits it at once, and an island that is shortened by
-        that makes no way, and squeezes the gap further. Inertia shortens the sliding and leaves the opening, which is stiff, as it is.
-        """
-        restrained = int(0)
-        for b in range(islands.count):
-            island = islands.label[b]
-            r = scalar(RELEASE) * restraint[b]
-            if r < scalar(RELEASED):
-                r = scalar(0.0)
-            if (
-                search.squeezed[island] != 0
-                and search.attempts[0] > 1
-                and least[island] < scalar(RESTRAIN)
-                and islands.driven[b] == 0
-            ):
-                r = wp.max(restraint[b], scalar(1.0)) / wp.max(least[island], scalar(LEAST_PART))
-                r = wp.min(r, scalar(MOST_RESTRAINT))
-            restraint[b] = r
-            if r > scalar(0.0):
-                restrained = 1
-        search.restrained[0] = restrained
 
     return SimpleNamespace(
         inertia=inertia,
@@ -600,10 +649,8 @@ def kernels(real: Real) -> SimpleNamespace:
         clear=clear,
         exempt=exempt,
         start=start,
-        before_search=before_search,
         decide=decide,
         note_motion=note_motion,
-        restrain=restrain,
     )
 
 
@@ -631,7 +678,10 @@ class Descent:
     p: (n + 1,) vec3, m, the motion that an iteration wants. numbers: on the device, see `status`: the largest such motion, m; forces, N; lag, m.
     descends: whether a motion has to lower the potential. frictional: whether friction is part of it. weighs: whether a step has also to leave no
     force that would move a body as a whole: for methods whose motions say little of how much is left, such as local-global iterations of stiff bodies.
+    renew: (1,) int32, whether the elastic Hessian and the preconditioner are made anew, of methods that have some.
     """
+
+    renew: wp.array | None = None
 
     def __init__(self, work, frictional: bool = True, descends: bool = True, weighs: bool = False):
         model = work.model
@@ -663,14 +713,16 @@ class Descent:
         vec3, scalar = real.vec3, real.scalar
         self.inertial, self.p = zeros(vec3), zeros(vec3, n + 1)
         self.vertex_energy = zeros(wp.float64)
-        self.lags, self.numbers = zeros(scalar), zeros(scalar, status.NUMBERS)
+        self.numbers = zeros(scalar, status.NUMBERS)
+        self.parts = Parts(device, n)
+        self.partial = zeros(scalar, self.parts.number)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
         self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
-        flags = (zeros(wp.int32, 1) for _ in range(6))
-        self.attempts, self.searching, self.hits, self.project, self.restrained, self.lowered = flags
+        flags = (zeros(wp.int32, 1) for _ in range(7))
+        self.attempts, self.searching, self.hits, self.project, self.restrained, self.lowered, self.whole = flags
         self.restraint = zeros(scalar, self.bodies)
         self.energies, self.search = filled(Energies, self), filled(Search, self)
         self.limits = limits(real)()
@@ -683,7 +735,6 @@ class Descent:
         self.motion.base, self.motion.u, self.motion.u_tilde = work.x_start, work.u, work.u_tilde
         self.motion.free, self.motion.center, self.motion.turn = model.free, self.center, self.turn
         self.pairs.project = self.project
-        self._make_room()
         tied = {int(owner[v]) for s in model.projector.sets if s.kind in TIES for v in s.vertices.ravel()}
         whole = [bool(free[low:high].all()) and b not in tied for b, (low, high) in enumerate(self.ranges)]
         self.weighs = weighs and any(whole)
@@ -710,26 +761,22 @@ class Descent:
     def grow(self) -> bool:
         """Makes room where a list was full."""
         grown = self.pairs.grow()
-        if grown:
-            self._make_room()
-            if self.friction is not None:
-                self.friction.grow()
+        if grown and self.friction is not None:
+            self.friction.grow()
         return grown
-
-    def _make_room(self) -> None:
-        counts = [self.model.vertex_count, self.pairs.capacity]
-        self.largest = Largest(self.device, self.model.real, counts)
 
     def start(self) -> None:
         """Before the first outer iteration: the potential where the step starts."""
         w = self.work
-        self.device.launch_serial(self.descending.start, [self.bodies, self.restraint, self.restrained, self.squeezed])
+        self.device.launch_serial(self.descending.start, [self.bodies, self.restraint, self.renew, self.search])
         if self.friction is not None:
             self.pairs.freeze(w.candidates, w.x)
             self.friction.lag()
         self.islands.find(w.candidates)
         self._evaluate(w.u, w.x)
-        self._keep_energies()
+        self._refer()
+        if self.bodies:
+            self.device.launch(self.descending.commit_energies, self.bodies, [self.base_new, self.base_old])
         if w.script.moves:
             self._find_crowded()
             w.script.hold()
@@ -757,21 +804,18 @@ class Descent:
     def _sum_energies(self) -> None:
         self.base_sums.add([self.model.projector.energies, self.vertex_energy], self.base_new)
 
-    def _keep_energies(self) -> None:
-        """The energies that were evaluated last, at w.u, are those that the next are compared with."""
+    def _refer(self) -> None:
+        """Energies count from what was accepted, at w.u."""
         if self.model.projector.cavities is not None:
             # a gas holds far more energy than a step changes, and what is put down to rounding is a part of the energy: so it counts from here
             self.model.projector.cavities.refer(self.work.x_start, self.work.u)
             self.model.projector.evaluate(self.work.x_start, self.work.u)
             self._sum_energies()
-        if self.bodies:
-            self.device.launch(self.descending.commit_energies, self.bodies, [self.base_new, self.base_old])
 
     def accept(self) -> None:
         """Line 16: the truncated motion, or as much of it as lowers the potential; and whether to go on."""
         w, t, model = self.work, self.work.truncation, self.model
         k, device, n, islands = self.descending, self.device, model.vertex_count, self.islands
-        device.launch_serial(k.before_search, [t.passes, self.hits, self.attempts, w.count])
         islands.renew(w.candidates)
         if w.script.moves:
             device.launch(k.note_motion, n, [model.free, self.p, w.count])
@@ -779,7 +823,7 @@ class Descent:
         if not self.descends and self.bodies:
             device.launch(k.exempt, self.bodies, [islands.driven])
         self._evaluate(t.u_end, t.x_end)
-        judging = [islands.groups, t.deep, self.energies, w.candidates.overflow, self.tolerated**2, self.search]
+        judging = [islands.groups, t.deep, self.energies, t.passes, w.candidates.overflow, self.tolerated**2, self.search]
         device.launch_serial(k.judge, judging)
 
         def search() -> None:
@@ -796,10 +840,9 @@ class Descent:
             device.launch_serial(k.judge, judging)
 
         device.loop(self.searching, search)
-        inputs = [w.candidates.overflow, w.x_start, w.script.goal, model.free, t.u_end, t.x_end]
-        device.launch(k.commit, n, [*inputs, w.u, w.x, self.lags])
-        self.largest.find([self.lags, self.pairs.change], self.numbers, [status.LAG, status.BARRIER_CHANGE])
-        self._keep_energies()
+        inputs = [w.candidates.overflow, self.motion, w.script.goal, model.free, t.truncated, self.parts.share, self.partial]
+        device.launch_blocks(k.commit, self.parts.number, [*inputs, w.x, self.numbers], grain=self.parts.size)
+        self._refer()
         if self.weighs:
             h = model.real.scalar(model.settings.time_step)
             inputs = [self.balanced, w.x_start, w.u, self.inertial, self.pairs.force_of_vertex, h, self.unbalanced]
@@ -809,5 +852,5 @@ class Descent:
             self._find_crowded()
         w.script.advance(w.x_start, w.u, t.fraction, w.count)
         states = [self.pairs.count, w.script.flags, w.candidates.overflow]
-        device.launch_serial(k.decide, [*states, self.search, self.limits, w.progress()])
-        device.launch_serial(k.restrain, [islands.groups, self.search, self.island_least, self.restraint])
+        bodies = [islands.groups, self.energies, self.island_least, self.restraint, self.renew]
+        device.launch_serial(k.decide, [*states, self.search, self.limits, w.progress(), *bodies])

@@ -31,11 +31,13 @@ import numpy as np
 import warp as wp
 
 from pdipc.barrier import exact, friction
-from pdipc.barrier.pairs import Exerted
+from pdipc.barrier.pairs import Exerted, frozen
 from pdipc.barrier.restitution import Restitution
+from pdipc.constraints.projector import corners
+from pdipc.constraints.projector import kernels_of as elastic_kernels
 from pdipc.device import blocks
-from pdipc.device.language import kernel, struct
-from pdipc.device.launch import Largest
+from pdipc.device.language import func, kernel, struct
+from pdipc.device.launch import Largest, Parts, Share
 from pdipc.device.precision import Real
 from pdipc.integration import status
 from pdipc.integration.script import led
@@ -43,7 +45,7 @@ from pdipc.linear.affine import AffineBodies
 from pdipc.linear.block_pcg import BlockPcg
 from pdipc.linear.blocks import BlockMatrix
 from pdipc.linear.wide_pcg import WidePcg
-from pdipc.nonlinear.descent import Descent, curved, turned, widened
+from pdipc.nonlinear.descent import Descent, Search, curved, turned, widened
 
 SAMPLES = 128  # vertices of a body that tell how it rotates
 GRIP = 1.0e6  # how much more than all of them those weigh that are held
@@ -52,7 +54,6 @@ MOST_TURN = 1.0  # rad of a step: of a longer one a part is made
 CREEP = 0.7  # of the last step: a step of a projected Hessian that is as long creeps
 MOST_STRETCH = 1024.0
 NEAR = 10.0  # tolerances: a step that is shorter, at indefinite Hessians, is one away from a saddle
-KEEP = 5.0  # tolerances: an outer iteration that moved less is followed by one with the same matrix
 PCG_TOLERANCE, PCG_MOST = 1.0e-3, 400
 REBOUND_TOLERANCE = {
     "float32": 1.0e-5,
@@ -71,11 +72,35 @@ class Samples:
 
 @functools.cache
 def kernels(real: Real) -> SimpleNamespace:
-    scalar, vec3, Led = real.scalar, real.vec3, led(real)
+    scalar, vec3, vec4, Led = real.scalar, real.vec3, real.vec4, led(real)
+    Frozen, Progress, Corners = frozen(real), status.progress(real), corners(real)
+    change, elastic_total = exact.kernels(real).change, elastic_kernels(real).total
+    block_largest, last_block = blocks.largest(vec4), blocks.last()
     module = real.module(__name__)
     wide = wp.float64
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
 
+    @func
+    def wanted(p: vec3, free: scalar) -> scalar:
+        """How far a free vertex wants to go; what is no number is infinitely far from its goal."""
+        moved = wp.length(p)
+        if not (moved < scalar(1.0e30)):
+            moved = scalar(wp.inf)
+        elif free == scalar(0.0):
+            moved = scalar(0.0)
+        return moved
+
+    @func
+    def lengthened(search: Search, progress: Progress, stretch: scalar) -> scalar:
+        """How many times its length a step is tried with. Where the potential curves down, the projected Hessian has a bound instead, and steps
+        creep, all alike or growing: as long as they do, each that descends is followed by one twice as long.
+        """
+        creeps = progress.numbers[status.MOVED] >= scalar(CREEP) * progress.numbers[status.MOVED_BEFORE]
+        if search.project[0] != 0 and search.whole[0] != 0 and creeps:
+            return wp.min(scalar(2.0) * stretch, scalar(MOST_STRETCH))
+        return scalar(1.0)
+
+    # Arguments: all that tells how far an iteration is from the end of the step, in one launch.
     @kernel(module)
     def measure(
         first: int,
@@ -83,39 +108,38 @@ def kernels(real: Real) -> SimpleNamespace:
         free: wp.array(dtype=scalar),
         rhs: wp.array(dtype=vec3),
         inertial: wp.array(dtype=vec3),
-        moved_out: wp.array(dtype=scalar),
-        force_out: wp.array(dtype=scalar),
-        scale_out: wp.array(dtype=scalar),
+        pairs: Frozen,
+        held: wp.array(dtype=scalar),
+        search: Search,
+        progress: Progress,
+        parts: Share,
+        partial: wp.array(dtype=vec4),
+        stretch: wp.array(dtype=scalar),
     ):
-        """How far each free vertex wants to go, and the forces on it; what is no number is infinitely far from its goal."""
-        i = first + wp.tid()
-        moved = wp.length(p[i])
-        if not (moved < scalar(1.0e30)):
-            moved = scalar(wp.inf)
-        moved_out[i] = moved
-        if free[i] == scalar(0.0) and moved < scalar(wp.inf):
-            moved_out[i] = scalar(0.0)
-        force_out[i] = wp.length(rhs[i])
-        scale_out[i] = wp.length(inertial[i])
-
-    @kernel(module)
-    def lengthen(
-        first: int,
-        projected: wp.array(dtype=wp.int32),
-        hits: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=scalar),
-        stretch_out: wp.array(dtype=scalar),
-    ):
-        """How many times its length a step is tried with. Where the potential curves down, the projected Hessian has a bound instead, and steps
-        creep, all alike or growing: as long as they do, each that descends is followed by one twice as long.
-        """
-        creeps = count[status.OUTER] > 0 and numbers[status.MOVED] >= scalar(CREEP) * numbers[status.MOVED_BEFORE]
-        if projected[0] != 0 and hits[0] == 0 and attempts[0] == 1 and creeps:
-            stretch_out[0] = wp.min(scalar(2.0) * stretch_out[0], scalar(MOST_STRETCH))
-        else:
-            stretch_out[0] = scalar(1.0)
+        """The largest motion that is wanted, forces, and changes of barriers by it, by blocks of threads; then how far the step is tried."""
+        worker = first + wp.tid()
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        largest = vec4()
+        begin = block * parts.size
+        for i in range(begin + lane, wp.min(begin + parts.size, free.shape[0]), wp.block_dim()):
+            largest = wp.max(largest, vec4(wanted(p[i], free[i]), wp.length(rhs[i]), wp.length(inertial[i]), scalar(0.0)))
+        for k in range(begin + lane, wp.min(begin + parts.size, pairs.count[0]), wp.block_dim()):
+            largest[3] = wp.max(largest[3], change(k, pairs, p, held))
+        largest = block_largest(largest)
+        if lane == 0:
+            partial[block] = largest
+        if last_block(parts.arrived, 0, parts.number):
+            largest = vec4()
+            for k in range(lane, parts.number, wp.block_dim()):
+                largest = wp.max(largest, partial[k])
+            largest = block_largest(largest)
+            if lane == 0:
+                progress.numbers[status.MOVED] = largest[0]
+                progress.numbers[status.FORCE] = largest[1]
+                progress.numbers[status.FORCE_SCALE] = largest[2]
+                progress.numbers[status.BARRIER_CHANGE] = largest[3]
+                stretch[0] = lengthened(search, progress, stretch[0])
 
     @kernel(module)
     def look_ahead(
@@ -142,17 +166,22 @@ def kernels(real: Real) -> SimpleNamespace:
     def begin(
         first: int,
         o: Led,
+        inertial: wp.array(dtype=vec3),
+        elastic: Corners,
         barrier: wp.array(dtype=vec3),
         friction: wp.array(dtype=vec3),
-        rhs: wp.array(dtype=vec3),
+        rhs_out: wp.array(dtype=vec3),
         p_out: wp.array(dtype=vec3),
     ):
         """The whole force; and where the step starts from: scripted vertices go to their targets where they are driven."""
         i = first + wp.tid()
-        total = rhs[i] + barrier[i]
+        total = inertial[i]
+        if elastic.offsets:
+            total = elastic_total(i, total, elastic)
+        total += barrier[i]
         if friction:
             total += friction[i]
-        rhs[i] = o.free[i] * total
+        rhs_out[i] = o.free[i] * total
         p_out[i] = vec3()
         if o.free[i] == scalar(0.0) and o.drive[wp.max(o.mover[i], 0)] != 0:
             p_out[i] = (o.target[i] - o.base[i]) - o.u[i]
@@ -286,30 +315,6 @@ def kernels(real: Real) -> SimpleNamespace:
         flag_out[0] = 1
 
     @kernel(module)
-    def choose(
-        first: int,
-        hits: wp.array(dtype=wp.int32),
-        attempts: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-        numbers: wp.array(dtype=scalar),
-        tolerance: scalar,
-        project_out: wp.array(dtype=wp.int32),
-        renew_out: wp.array(dtype=wp.int32),
-    ):
-        """The Hessian is projected until an iteration has gone its whole way: far from the end, negative curvature misleads. Elastic
-        Hessian and preconditioner are kept for an iteration when the last one moved so little that it may well be the last, and they
-        are exact: a projected one, or one from where a body was stretched by what rotated it, is too stiff to tell how much is left.
-        """
-        was_projected = project_out[0] != 0
-        project_out[0] = 1
-        renew = int(1)
-        if count[status.OUTER] > 0 and hits[0] == 0 and attempts[0] == 1:
-            project_out[0] = 0
-            if renew_out[0] == 1 and not was_projected and numbers[status.MOVED] <= scalar(KEEP) * tolerance:
-                renew = int(0)
-        renew_out[0] = renew
-
-    @kernel(module)
     def compare(
         first: int,
         free: wp.array(dtype=scalar),
@@ -345,7 +350,6 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         measure=measure,
-        lengthen=lengthen,
         look_ahead=look_ahead,
         begin=begin,
         find_turn=find_turn,
@@ -353,7 +357,6 @@ def kernels(real: Real) -> SimpleNamespace:
         propose=propose,
         any_driven=any_driven,
         set_flag=set_flag,
-        choose=choose,
         compare=compare,
         leave_saddle=leave_saddle,
         restart=restart,
@@ -409,15 +412,28 @@ class Newton(Descent):
             setattr(self.samples, name, wp.array(np.asarray(values, dtype=kind), device=device.warp))
         vec3, scalar = real.vec3, real.scalar
         self.rhs, self.curved = zeros(vec3), zeros(vec3, n + 1)
-        self.moved, self.forces, self.scales = (zeros(scalar) for _ in range(3))
+        self.moved, self.curves = (zeros(scalar) for _ in range(2))
         self.lengths, self.stretch, self.unrestrained = zeros(scalar, 2), zeros(scalar, 1), zeros(scalar, self.bodies)
         self.own_part, self.part = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.renew, self.driving = zeros(wp.int32, 1), zeros(wp.int32, 1)
         self.driven = zeros(wp.int32)
         self.nobody = zeros(wp.int32, len(work.script.movers))
-        self.largest_of_two, self.largest_of_three = (Largest(device, real, [n] * k) for k in (2, 3))
+        self.largest_of_two = Largest(device, real, [n] * 2)
+        self._make_parts()
         self.iterations = self.solver.iterations
         self.inner = zeros(wp.int32, 1)  # no local-global iterations
+
+    def _make_parts(self) -> None:
+        """How vertices and pairs are cut where they are measured."""
+        self.measured = Parts(self.device, max(self.model.vertex_count, self.pairs.capacity))
+        self.largest = wp.zeros(self.measured.number, dtype=self.model.real.vec4, device=self.device.warp)
+
+    def grow(self) -> bool:
+        """Makes room where a list was full."""
+        grown = super().grow()
+        if grown:
+            self._make_parts()
+        return grown
 
     def exerted(self) -> tuple[Exerted, Exerted]:
         """See `nonlinear.Method`: the gradients of barrier and friction where the step ended."""
@@ -437,7 +453,6 @@ class Newton(Descent):
     def freeze(self) -> None:
         """Line 5: barriers and their derivatives are those at x since x was accepted; friction has those of where the step started."""
         w = self.work
-        self.device.launch_serial(self.kernels.choose, [*self._last(), self.project, self.renew])
         if self.friction is not None:
             self.friction.differentiate(w.u, self.project)
             self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
@@ -455,28 +470,23 @@ class Newton(Descent):
         self.pairs.freeze(w.candidates, w.x, w.x_tilde, self.driven)
         self.pairs.differentiate(w.x)
 
-    def _last(self) -> list:
-        """What is known of the last outer iteration."""
-        return [self.hits, self.attempts, self.work.count, self.numbers, self.model.real.scalar(self.model.settings.tolerance)]
-
     def solve(self) -> None:
         """Lines 6 to 12: x~ = x + p with K p = -grad Phi."""
         w, k, device, n, model = self.work, self.kernels, self.device, self.model.vertex_count, self.model
-        model.projector.add_forces(w.x_start, w.u, self.rhs, self.inertial)
+        model.projector.find_forces(w.x_start, w.u)
         friction = None if self.friction is None else self.friction.force_of_vertex
         led = w.led()
-        device.launch(k.begin, n, [led, self.pairs.force_of_vertex, friction, self.rhs, self.p])
+        device.launch(
+            k.begin, n, [led, self.inertial, model.projector.corners, self.pairs.force_of_vertex, friction, self.rhs, self.p]
+        )
         if self.affine is not None:
             self.affine.fold(self.rhs)
         device.when(self.renew, self._assemble)
         self._solve_linear()
         device.when(self.solver.indefinite, self._solve_projected)
-        device.launch(k.measure, n, [self.p, model.free, self.rhs, self.inertial, self.moved, self.forces, self.scales])
-        wanted = [self.moved, self.forces, self.scales]
-        self.largest_of_three.find(wanted, self.numbers, [status.MOVED, status.FORCE, status.FORCE_SCALE])
-        self.pairs.measure_change(self.p, self.matrix.held)
-        states = [self.project, self.hits, self.attempts, w.count]
-        device.launch_serial(k.lengthen, [*states, self.numbers, self.stretch])
+        inputs = [self.p, model.free, self.rhs, self.inertial, self.pairs.frozen, self.matrix.held, self.search, w.progress()]
+        inputs += [self.measured.share, self.largest, self.stretch]
+        device.launch_blocks(k.measure, self.measured.number, inputs, grain=self.measured.size)
         if self.bodies:
             inputs = [self.samples, model.free, w.x_start, w.u, self.p, self.stretch, self.center, self.turn, self.own_part]
             device.launch_blocks(k.find_turn, self.bodies, inputs, grain=SAMPLES)
@@ -507,8 +517,8 @@ class Newton(Descent):
             self.friction.differentiate(w.u, self.project)
         self._assemble()
         self._solve_linear()
-        device.launch(k.compare, n, [model.free, self.p, self.curved, self.moved, self.lags])
-        self.largest_of_two.find([self.moved, self.lags], self.lengths, [0, 1])
+        device.launch(k.compare, n, [model.free, self.p, self.curved, self.moved, self.curves])
+        self.largest_of_two.find([self.moved, self.curves], self.lengths, [0, 1])
         limit = model.real.scalar(NEAR * model.settings.tolerance)
         device.launch(k.leave_saddle, n, [model.free, self.lengths, limit, self.curved, self.p])
         if self.affine is not None:
@@ -523,7 +533,9 @@ class Newton(Descent):
         r.linearize_exact(w.rest)
         led = w.led()
         led.drive = self.nobody
-        self.device.launch(self.kernels.begin, n, [led, self.pairs.force_of_vertex, None, r.zero, self.p])
+        self.device.launch(
+            self.kernels.begin, n, [led, r.zero, corners(model.real)(), self.pairs.force_of_vertex, None, r.zero, self.p]
+        )
         couplings = [each for each in self._couplings() if each is not self.friction]
         self.solver.prepare(w.x, couplings)
         self.solver.solve(self.p, r.zero, couplings, 0.0, self.nobody, REBOUND_TOLERANCE[model.real.name])
