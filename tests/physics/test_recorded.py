@@ -1,6 +1,7 @@
 """A step as one recorded graph gives the bits of the same step launched kernel by kernel, however it is watched."""
 
 import itertools
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp as wp
 import pdipc
 import pdipc.device.launch
 from pdipc.drive import Work, step
+from pdipc.linear.solvers import SOLVERS
 from physics.scenes import cloth, floor, scene, solid
 
 
@@ -90,6 +92,28 @@ def test_a_driver_without_loops_in_graphs(monkeypatch):
         positions, found = run("float64")
     assert np.array_equal(positions, expected)
     assert found == counts
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_no_solver_records_where_the_driver_has_no_loops(solver, monkeypatch):
+    """The same motion of a sheet in free fall, with nothing recorded."""
+    described = scene(
+        [cloth("sheet", [0.4, 0.4], [3, 3], at=(0, 0.3, 0))],
+        [floor(2.0)],
+        contact={"method": "paper"} if solver == "a-jacobi" else {},
+        precision="float64",
+        linear_solver=solver,
+        **{} if solver == "a-jacobi" else {"nonlinear_solver": "local-global"},
+    )
+    expected = pdipc.Simulation(described, "cpu")
+    expected.step()
+    monkeypatch.setattr(pdipc.device.launch.Device, "records_loops", False)
+    monkeypatch.setattr(pdipc.device.launch.Device, "capture", lambda *_: pytest.fail("recorded"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*has no loops in graphs")
+        found = pdipc.Simulation(described, "cpu")
+    found.step()
+    assert np.array_equal(found.positions, expected.positions)
 
 
 def test_recording_allocates_nothing(monkeypatch):

@@ -33,7 +33,10 @@ def interval(system: "System") -> tuple[float, float]:
     start = np.random.default_rng(0).standard_normal((system.count, 3)) * np.sqrt(np.abs(system.matrix.diagonal()))[:, None]
     b = wp.array(start.astype(system.real.numpy), dtype=system.real.vec3, device=system.device.warp)
     x = wp.zeros(system.count, dtype=system.real.vec3, device=system.device.warp)
-    system.device.capture(lambda: solver.solve(x, b), solver).launch()
+    if system.device.records_loops:
+        system.device.capture(lambda: solver.solve(x, b), solver).launch()
+    else:
+        solver.solve(x, b)
     count = int(solver.iterations.numpy()[0])
     alpha, beta = solver.steps.numpy()[:count].astype(np.float64).T
     count = int(np.argmin(np.append(alpha > 0.0, False)))  # in float32 a stiff matrix may end with a step that is rounding
