@@ -534,7 +534,8 @@ class Script:
 
     def _last(self, time: float, now: Reached, lag: float, positions: wp.array) -> tuple[float, str]:
         """How far, m, the last is behind its script, and the sentence that names it, or nothing; see `settle`. now: after the step."""
-        late = [isinstance(way.path, Trajectory) and way.times[-1] < time for way in self._ways]
+        ways = zip(self.movers, self._ways, strict=True)  # of what never moves the ways are those of an earlier step
+        late = [not mover.still and isinstance(way.path, Trajectory) and way.times[-1] < time for mover, way in ways]
         if not (lag > 0.0 or any(late)):
             return 0.0, ""
         x, away = positions.numpy(), []

@@ -622,19 +622,34 @@ def kernels(real: Real) -> SimpleNamespace:
         if renew:
             choose(search, progress.numbers[status.MOVED], limits.tolerance, renew)
         search.attempts[0] = 0
-        progress.count[status.MOVING] = 0
 
     @kernel(module)
     def note_motion(
         first: int,
         free: wp.array(dtype=scalar),
         p: wp.array(dtype=vec3),
-        count: wp.array(dtype=wp.int32),
+        parts: Share,
+        partial: wp.array(dtype=scalar),
+        count_out: wp.array(dtype=wp.int32),
     ):
-        """Whether anything scripted moves in this iteration; whoever writes, writes the same."""
-        i = first + wp.tid()
-        if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
-            count[status.MOVING] = 1
+        """Whether anything scripted moves in this iteration, by blocks of threads."""
+        worker = first + wp.tid()
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        moves = scalar(0.0)
+        for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, free.shape[0]), wp.block_dim()):
+            if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
+                moves = scalar(1.0)
+        moves = largest_number(moves)
+        if lane == 0:
+            partial[block] = moves
+        if last_block(parts.arrived, 0, parts.number):
+            moves = scalar(0.0)
+            for k in range(lane, parts.number, wp.block_dim()):
+                moves = wp.max(moves, partial[k])
+            moves = largest_number(moves)
+            if lane == 0:
+                count_out[status.MOVING] = int(moves)
 
     return SimpleNamespace(
         inertia=inertia,
@@ -818,7 +833,8 @@ class Descent:
         k, device, n, islands = self.descending, self.device, model.vertex_count, self.islands
         islands.renew(w.candidates)
         if w.script.moves:
-            device.launch(k.note_motion, n, [model.free, self.p, w.count])
+            inputs = [model.free, self.p, self.parts.share, self.partial, w.count]
+            device.launch_blocks(k.note_motion, self.parts.number, inputs, grain=self.parts.size)
             islands.find_driven(w.candidates, w.u, w.u_tilde)
         if not self.descends and self.bodies:
             device.launch(k.exempt, self.bodies, [islands.driven])
