@@ -299,7 +299,7 @@ def test_the_page(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGINT to send")
 def test_an_interrupt_stops_a_sweep_and_resume_finishes_it(scene, tmp_path):
     """Ctrl-C while runs are under way on processes of this machine: one message, no table; then the table of a serial sweep."""
-    scene.write_text(SCENE.replace("steps = 8", "steps = 900"))
+    scene.write_text(SCENE.replace("steps = 8", "steps = 500"))
     settings = {"contact.friction": [0.0, 0.5]}
     command = [sys.executable, "-m", "pdipc", "sweep", str(scene), "--set", "contact.friction=0.0,0.5", "--workers", "2"]
     command += ["-o", str(tmp_path / "swept")]
