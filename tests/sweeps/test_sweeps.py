@@ -1,6 +1,7 @@
 """Sweeps: every combination once, whatever happens to the workers, and a table with the bits of a serial one."""
 
 import csv
+import functools
 import json
 import os
 import re
@@ -299,11 +300,13 @@ def test_the_page(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGINT to send")
 def test_an_interrupt_stops_a_sweep_and_resume_finishes_it(scene, tmp_path):
     """Ctrl-C while runs are under way on processes of this machine: one message, no table; then the table of a serial sweep."""
-    scene.write_text(SCENE.replace("steps = 8", "steps = 500"))
+    scene.write_text(SCENE.replace("steps = 8", "steps = 300"))
     settings = {"contact.friction": [0.0, 0.5]}
     command = [sys.executable, "-m", "pdipc", "sweep", str(scene), "--set", "contact.friction=0.0,0.5", "--workers", "2"]
     command += ["-o", str(tmp_path / "swept")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "PDIPC_THREADS": "1"})
+    heard = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what a shell starts in the background ignores it
+    environment = {**os.environ, "PDIPC_THREADS": "1"}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, preexec_fn=heard)
     while process.poll() is None and not list(tmp_path.glob("swept/*/frames/000020.npy")):
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
