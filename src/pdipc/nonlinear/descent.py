@@ -7,7 +7,7 @@ The potential of a step is that of Section 3, with the barrier and lagged fricti
 over the displacements u since the start of the step. After truncation Phi is compared, island by island. Where it rose, the island goes back
 along the same direction: first all of it to the least fraction that truncation left to one of its vertices, then by halves. What CCD has not
 proven is proven anew. So every outer iteration descends, unless a script moves something that the island may touch: then the potential itself
-has changed.
+has changed, and the island only goes back to the least fraction where truncation cut its step and it rose tenfold.
 """
 
 import functools
@@ -180,6 +180,22 @@ def kernels(real: Real) -> SimpleNamespace:
     least_number, largest_number, last_block = blocks.least(scalar), blocks.largest(scalar), blocks.last()
     total_number, total_vector, total_matrix = (blocks.total(each) for each in (wide, wp.vec3d, wp.mat33d))
 
+    @func
+    def largest_of_all(mine: scalar, worker: int, parts: Share, partial: wp.array(dtype=scalar)) -> scalar:
+        """The largest number of all threads, none of which is negative, in the block that is done last; in the others -1."""
+        block = worker // wp.block_dim()
+        lane = worker % wp.block_dim()
+        largest = largest_number(mine)
+        if lane == 0:
+            partial[block] = largest
+        result = scalar(-1.0)
+        if last_block(parts.arrived, 0, parts.number):
+            largest = scalar(0.0)
+            for k in range(lane, parts.number, wp.block_dim()):
+                largest = wp.max(largest, partial[k])
+            result = largest_number(largest)
+        return result
+
     @kernel(module)
     def inertia(
         first: int,
@@ -231,7 +247,8 @@ def kernels(real: Real) -> SimpleNamespace:
             island = islands.label[b]
             ok = search.accepted[island]
             unseen = slack * wp.abs(e.before[island]) + negligible
-            if e.after[island] > wide(FIERCE) * wp.abs(e.before[island]) + unseen and search.attempts[0] == 0:
+            risen = e.after[island] > wide(FIERCE) * wp.abs(e.before[island]) + unseen
+            if risen and search.attempts[0] == 0 and search.hits[0] > 0:
                 ok = 0
             if e.after[island] <= e.before[island] + unseen or search.attempts[0] > HALVINGS:
                 ok = 1
@@ -337,16 +354,9 @@ def kernels(real: Real) -> SimpleNamespace:
                 x_out[i] = t.x_end[i]
                 if free[i] == scalar(0.0):
                     lag = wp.max(lag, wp.length((goal[i] - o.base[i]) - t.u_end[i]))
-        lag = largest_number(lag)
-        if lane == 0:
-            partial[block] = lag
-        if last_block(parts.arrived, 0, parts.number):
-            lag = scalar(0.0)
-            for k in range(lane, parts.number, wp.block_dim()):
-                lag = wp.max(lag, partial[k])
-            lag = largest_number(lag)
-            if lane == 0:
-                numbers_out[status.LAG] = lag
+        lag = largest_of_all(lag, worker, parts, partial)
+        if lane == 0 and lag >= scalar(0.0):
+            numbers_out[status.LAG] = lag
 
     @kernel(module)
     def commit_energies(
@@ -640,16 +650,9 @@ def kernels(real: Real) -> SimpleNamespace:
         for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, free.shape[0]), wp.block_dim()):
             if free[i] == scalar(0.0) and wp.length_sq(p[i]) > scalar(0.0):
                 moves = scalar(1.0)
-        moves = largest_number(moves)
-        if lane == 0:
-            partial[block] = moves
-        if last_block(parts.arrived, 0, parts.number):
-            moves = scalar(0.0)
-            for k in range(lane, parts.number, wp.block_dim()):
-                moves = wp.max(moves, partial[k])
-            moves = largest_number(moves)
-            if lane == 0:
-                count_out[status.MOVING] = int(moves)
+        moves = largest_of_all(moves, worker, parts, partial)
+        if lane == 0 and moves >= scalar(0.0):
+            count_out[status.MOVING] = int(moves)
 
     return SimpleNamespace(
         inertia=inertia,
