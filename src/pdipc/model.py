@@ -223,10 +223,11 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     assembly.masses = masses
     sim = scene.simulation
     device = device if isinstance(device, Device) else Device(device or sim.device, thread_count_for(len(assembly.positions)))
-    precision = real(_precision(sim.precision, device.is_cuda, unresolved(scene, assembly)))
+    too_stiff = unresolved(scene, assembly)
+    precision = real(_precision(sim.precision, device.is_cuda, too_stiff))
     told = len(assembly.notes)
     refuse(scene, assembly, precision.name)
-    for note in [*assembly.notes[told:], *(unresolved(scene, assembly) if precision.name == "float32" else [])]:
+    for note in [*assembly.notes[told:], *(too_stiff if precision.name == "float32" else [])]:
         warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene.settled(), assembly, device, precision)
 

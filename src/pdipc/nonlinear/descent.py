@@ -336,7 +336,6 @@ def kernels(real: Real) -> SimpleNamespace:
         overflow: wp.array(dtype=wp.int32),
         o: Motion,
         goal: wp.array(dtype=vec3),
-        free: wp.array(dtype=scalar),
         t: Truncated,
         parts: Share,
         partial: wp.array(dtype=scalar),
@@ -349,10 +348,10 @@ def kernels(real: Real) -> SimpleNamespace:
         lane = worker % wp.block_dim()
         lag = scalar(0.0)
         if overflow[0] == 0:
-            for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, free.shape[0]), wp.block_dim()):
+            for i in range(block * parts.size + lane, wp.min((block + 1) * parts.size, o.free.shape[0]), wp.block_dim()):
                 o.u[i] = t.u_end[i]
                 x_out[i] = t.x_end[i]
-                if free[i] == scalar(0.0):
+                if o.free[i] == scalar(0.0):
                     lag = wp.max(lag, wp.length((goal[i] - o.base[i]) - t.u_end[i]))
         lag = largest_of_all(lag, worker, parts, partial)
         if lane == 0 and lag >= scalar(0.0):
@@ -859,7 +858,7 @@ class Descent:
             device.launch_serial(k.judge, judging)
 
         device.loop(self.searching, search)
-        inputs = [w.candidates.overflow, self.motion, w.script.goal, model.free, t.truncated, self.parts.share, self.partial]
+        inputs = [w.candidates.overflow, self.motion, w.script.goal, t.truncated, self.parts.share, self.partial]
         device.launch_blocks(k.commit, self.parts.number, [*inputs, w.x, self.numbers], grain=self.parts.size)
         self._refer()
         if self.weighs:
