@@ -208,7 +208,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--cases", type=json.loads, help=argparse.SUPPRESS)
-    parser.add_argument("--predict", action="store_true", help="what the peers' scenes should take, without a GPU")
+    parser.add_argument(
+        "--predict", action="store_true", help="what the peers' scenes and Table 1's should take, without a GPU"
+    )
     options = parser.parse_args(arguments)
     if options.predict:
         predict.print_table()

@@ -23,6 +23,7 @@ import pdipc
 from pdipc import algorithm
 from pdipc.device.launch import BLOCK, CUDA_BLOCK, CUDA_WORKERS, Device
 from pdipc.linear.wide_pcg import TURN as ITERATIONS
+from pdipc.reproduce.table1 import COLUMNS, ROWS
 from pdipc.work import Work
 
 LAUNCH = 3.0e-6  # s of a kernel in a graph that waits for the one before, and does next to nothing
@@ -32,6 +33,7 @@ LATENCY = 0.23e-6  # s of a read from memory: 400 cycles at 1755 MHz (H100; doi:
 ROW = 32  # entries at most of a thread's own row in an array; where its share would be more, it reads one
 WORD = 16  # bytes, the most that a thread reads at once
 MEMORY = 80.0e9  # bytes
+ORDER = [*(("peer scenes", name) for name in peer_scenes.SCENES), *(("paper scenes", name) for name in ROWS)]
 MEASURED = Path(__file__).parent / "results" / "gpu.json"
 
 
@@ -120,10 +122,10 @@ def memory_of(root: Any) -> int:
     return sum(found.values())
 
 
-def predict(name: str, row: dict) -> dict:
+def predict(name: str, scene: pdipc.Scene, row: dict) -> dict:
     """row: what was measured of the scene: outer and linear iterations, truncations, barriers, mean milliseconds."""
     place = Tracer()
-    model = pdipc.build(peer_scenes.scene(name, precision="float32"), place)
+    model = pdipc.build(scene, place)
     work = Work(model, recorded=False)
     while work.method.pairs.capacity < row["barriers"]:
         work.method.pairs.count.assign([0, int(row["barriers"]), 0])
@@ -164,21 +166,32 @@ def predict(name: str, row: dict) -> dict:
     }
 
 
-def print_table() -> None:
-    measured = {
-        row["case"]: row
-        for row in json.loads(MEASURED.read_text())["results"]
-        if row.get("part") == "peer scenes" and "outer" in row
-    }
-    print(
-        "| scene | DOF | launches | GB moved | ms, H100 | ms, RTX 3090 | measured, H100 | measured / predicted | memory, MB | DOF in 80 GB |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in peer_scenes.SCENES:
-        if name in measured:
-            r = predict(name, measured[name])
-            print(
-                f"| {name} | {r['DOF']:,} | {r['launches']:,.0f} | {r['GB']:.2f} | {r['H100']:.1f} | {r['RTX 3090']:.1f} | {r['measured']:.1f} | "
-                f"{r['measured'] / r['H100']:.1f} | {r['MB']:.0f} | {r['largest'] / 1e6:.0f} M |",
-                flush=True,
-            )
+HEADER = (
+    "| scene | DOF | launches | GB moved | ms, H100 | ms, RTX 3090 | measured, H100 | measured / predicted | the paper's, RTX 3090 | memory, MB | DOF in 80 GB |",
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+)
+PAPER_STAGES = slice(COLUMNS.index("solver ms"), COLUMNS.index("misc ms") + 1)
+
+
+def print_table(names: Sequence[str] = ()) -> None:
+    """Of the peers' scenes, and of Table 1's rows at the paper's size, whose own milliseconds stand beside; all that were measured or those named."""
+    measured = {(row["part"], row["case"]): row for row in json.loads(MEASURED.read_text())["results"] if "outer" in row}
+    print("\n".join(HEADER))
+    for part, name in ORDER:
+        if (part, name) not in measured or (names and name not in names):
+            continue
+        row = measured[part, name]
+        paper = ROWS[name].paper if part == "paper scenes" else None
+        try:
+            scene = ROWS[name].full() if paper else peer_scenes.scene(name)
+        except FileNotFoundError as error:  # optional data
+            print(f"| {name} | {error} |", flush=True)
+            continue
+        scene = scene.model_copy(update={"simulation": scene.simulation.model_copy(update={"precision": "float32"})})
+        r = predict(name, scene, row)
+        theirs = f"{sum(map(float, paper[PAPER_STAGES])):.1f}" if paper else ""
+        print(
+            f"| {name} | {r['DOF']:,} | {r['launches']:,.0f} | {r['GB']:.2f} | {r['H100']:.1f} | {r['RTX 3090']:.1f} | {r['measured']:.1f} | "
+            f"{r['measured'] / r['H100']:.1f} | {theirs} | {r['MB']:.0f} | {r['largest'] / 1e6:.0f} M |",
+            flush=True,
+        )

@@ -110,9 +110,10 @@ def test_prediction(monkeypatch):
     import gpu_predict
 
     row = {"outer": 3.0, "linear_iterations": 40.0, "truncations": 0.0, "barriers": 100.0, "mean ms": 1.0}
-    found = gpu_predict.predict("s2_2", row)
+    scene = gpu_predict.peer_scenes.scene("s2_2", precision="float32")
+    found = gpu_predict.predict("s2_2", scene, row)
     assert found["an iteration"] == 3
     assert found["RTX 3090"] >= found["H100"] > 1e3 * gpu_predict.LAUNCH * found["launches"] + found["memory ms"]
-    more = gpu_predict.predict("s2_2", row | {"linear_iterations": 140.0})
+    more = gpu_predict.predict("s2_2", scene, row | {"linear_iterations": 140.0})
     assert more["launches"] - found["launches"] == pytest.approx(300)
     assert more["H100"] > found["H100"]
