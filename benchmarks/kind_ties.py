@@ -277,13 +277,9 @@ def worn(rng: Generator, size: float) -> Parts:
     lace = {"name": "lace", "kind": "rod", "mesh": {"shape": "rope", "length": 0.3 * size, "segments": 14}}
     lace |= {"rotation": [0.0, 90.0, 0.0], "translation": [0.06 * size, 0.112 * size, reach + 0.17 * size]}
     lace["material"] = cord(rng, 0.5 * size) | {"radius": 0.004 * size, "young_modulus": between(rng, 1e5, 1e7)}
+    sewn_on = {"bodies": ("button", "cape"), "within": 0.035 * size, "stiffness": between(rng, 2.0, 100.0)}
     ties = [
-        {
-            "bodies": ("button", "cape"),
-            "within": 0.04 * size,
-            "stiffness": between(rng, 100.0, 5e3),
-            "rest_length": 0.01 * size,
-        },
+        sewn_on if rng.random() < 0.5 else sewn_on | {"rest_length": 0.01 * size},
         {"bodies": ("lace", "cape"), "within": 0.05 * size, "stiffness": between(rng, 100.0, 5e3)},
     ]
     return {"bodies": [body, sheet, button, lace], "attachments": ties, "obstacles": [floor(size, -0.4 * size)]}
