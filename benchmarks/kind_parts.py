@@ -76,9 +76,11 @@ def pillow(rng: Generator, size: float) -> dict:
         "volume": float(np.prod(sides)) * between(rng, 0.9, 1.5),
         "rise": 0.05,
     }
-    inside = [{"pressure": between(rng, 5.0, 500.0) * size}, gas, liquid][rng.integers(3)]
+    pressure = between(rng, 5.0, 500.0) * size
+    which = rng.integers(3)
     plain = ("areal_density", "membrane_stiffness", "bending_stiffness")
     material = {key: value for key, value in woven(rng, size).items() if key in plain}
+    inside = [{"pressure": min(pressure, material["membrane_stiffness"] / size)}, gas, liquid][which]  # more would burst it
     return {"mesh": {"shape": "box", "size": list(sides), "cells": [6, 1, 6]}, "material": material, "inside": inside}
 
 

@@ -229,7 +229,7 @@ def pressed(rng: Generator, size: float) -> Parts:
         below |= {"mesh": coil, "material": bent(rng, cord(rng, size) | {"radius": 0.012 * size}, 0.01, 1.0, (0.0, 1.0))}
     if kind == "pillow":
         below["inside"] = [
-            {"pressure": between(rng, 5.0, 500.0) * size},
+            {"pressure": min(between(rng, 5.0, 500.0) * size, below["material"]["membrane_stiffness"] / size)},
             {"gas": 101325.0, "volume": 0.02 * size**3, "rise": 0.05},
         ][rng.integers(2)]
     apart = 0.27 * size
