@@ -7,7 +7,7 @@ The potential of a step is that of Section 3, with the barrier and lagged fricti
 over the displacements u since the start of the step. After truncation Phi is compared, island by island. Where it rose, the island goes back
 along the same direction: first all of it to the least fraction that truncation left to one of its vertices, then by halves. What CCD has not
 proven is proven anew. So every outer iteration descends, unless a script moves something that the island may touch: then the potential itself
-has changed, and the island only goes back to the least fraction where truncation cut its step and it rose tenfold.
+has changed, and the island only goes back where truncation cut its step and it rose tenfold: to the least fraction, then by a few halves.
 """
 
 import functools
@@ -32,6 +32,7 @@ from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL, led
 
 FIERCE = 10.0  # times its potential: where what is driven raises it by more, truncation has cut the step unevenly, and it is made even first
+PULLED = 5  # how often such a step is then halved, at most: what is driven may have to raise it
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -248,7 +249,7 @@ def kernels(real: Real) -> SimpleNamespace:
             ok = search.accepted[island]
             unseen = slack * wp.abs(e.before[island]) + negligible
             risen = e.after[island] > wide(FIERCE) * wp.abs(e.before[island]) + unseen
-            if risen and search.attempts[0] == 0 and search.hits[0] > 0:
+            if risen and search.attempts[0] <= PULLED and search.hits[0] > 0:
                 ok = 0
             if e.after[island] <= e.before[island] + unseen or search.attempts[0] > HALVINGS:
                 ok = 1
