@@ -6,7 +6,7 @@ in, with its threads, and with the bytes of the arrays that it is given, each on
     a step = sum over launches of (LAUNCH + max(bytes / bandwidth, reads of a thread x LATENCY)) + turns x LOOP_TURN.
 
 A thread reads its share of the arrays, up to 16 bytes at a time, and one read waits for the other, as reads through an index do: few threads do not
-fill the memory's pipes, however fast it is. That is a model to be refuted: it knows no cache (what stays in it makes steps faster), no reads
+fill the memory's pipes, however fast it is. Flops are counted as a multiplication and an addition for each floating-point number of these arrays. That is a model to be refuted: it knows no cache (what stays in it makes steps faster), no reads
 that overlap, no whole arrays of which little is read (both likewise), and no work that is uneven among threads (which makes them slower).
 """
 
@@ -22,6 +22,7 @@ import warp as wp
 import pdipc
 from pdipc import algorithm
 from pdipc.device.launch import BLOCK, CUDA_BLOCK, CUDA_WORKERS, Device
+from pdipc.integration.status import STAGES
 from pdipc.linear.wide_pcg import TURN as ITERATIONS
 from pdipc.reproduce.table1 import COLUMNS, ROWS
 from pdipc.work import Work
@@ -38,14 +39,21 @@ MEASURED = Path(__file__).parent / "results" / "gpu.json"
 
 
 class Launch(NamedTuple):
-    """A kernel's name, the bytes of its arrays, and how many reads a thread makes of them."""
+    """A kernel's name, its stage, the bytes of its arrays, how many numbers they have, and how many reads a thread makes of them."""
 
     kernel: str
+    stage: str
     bytes: int
+    numbers: int
     reads: int
 
     def seconds(self, bandwidth: float) -> float:
         return LAUNCH + max(self.bytes / bandwidth, self.reads * LATENCY)
+
+    def limit(self, bandwidth: float) -> str:
+        """What most of its time goes to."""
+        parts = {"launches": LAUNCH, "bandwidth": self.bytes / bandwidth, "latency": self.reads * LATENCY}
+        return max(parts, key=parts.__getitem__)
 
 
 class Tracer(Device):
@@ -56,16 +64,26 @@ class Tracer(Device):
         self.wide, self.block = True, CUDA_BLOCK
         self.launches: dict[tuple[int, ...], list[Launch]] = defaultdict(list)
         self._inside: tuple[int, ...] = ()
+        self._waiting: list[tuple[tuple[int, ...], Launch]] = []  # for the mark at the end of their stage
 
     def _note(self, name: str, threads: int, inputs: Sequence[Any], shared: bool = False) -> None:
         """shared: whether the threads share the arrays out; else each has an index, and rows of a few entries."""
         arrays = {each.ptr: (each.size, wp.types.type_size_in_bytes(each.dtype)) for each in _arrays(inputs)}
         moved = sum(count * width for count, width in arrays.values())
+        numbers = sum(each.size * _numbers(each.dtype) for each in {each.ptr: each for each in _arrays(inputs)}.values())
         reads = 0
         for count, width in arrays.values():
             own = -(-count // threads)
             reads += (own if shared or own <= ROW else 1) * -(-width // WORD)
-        self.launches[self._inside].append(Launch(name, moved, reads))
+        self._waiting.append((self._inside, Launch(name, "misc", moved, numbers, reads)))
+        if name == "mark":
+            self.conclude(STAGES[inputs[0]])
+
+    def conclude(self, stage: str) -> None:
+        """All launches since the last time are of that stage."""
+        for inside, launch in self._waiting:
+            self.launches[inside].append(launch._replace(stage=stage))
+        self._waiting = []
 
     def launch(self, kernel, dim, inputs, grain=1):
         self._note(kernel.key, dim, inputs)
@@ -103,6 +121,13 @@ def _arrays(inputs: Sequence[Any]):
             yield from (value for value in vars(each).values() if isinstance(value, wp.array))
 
 
+def _numbers(dtype: Any) -> int:
+    """Floating-point numbers of an entry."""
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    floating = scalar in (wp.float32, wp.float64, float)
+    return wp.types.type_size_in_bytes(dtype) // wp.types.type_size_in_bytes(scalar) if floating else 0
+
+
 def memory_of(root: Any) -> int:
     """Bytes of all arrays that can be reached from an object of the package."""
     found, seen, left = {}, set(), [root]
@@ -130,8 +155,10 @@ def predict(name: str, scene: pdipc.Scene, row: dict) -> dict:
     while work.method.pairs.capacity < row["barriers"]:
         work.method.pairs.count.assign([0, int(row["barriers"]), 0])
         work.method.grow()
+    place.conclude("misc")
     place.launches.clear()
     algorithm.time_step(work)
+    place.conclude("misc")
     method, outer, going = work.method, row["outer"], work.going.ptr
     conjugate = (going, method.solver.condition.ptr)
     turns = {
@@ -152,7 +179,9 @@ def predict(name: str, scene: pdipc.Scene, row: dict) -> dict:
         )
 
     memory = memory_of(work)
+    made = [(number, each) for key, number in turns.items() for each in place.launches[key]]
     return {
+        "stages": {stage: _sum([(number, each) for number, each in made if each.stage == stage]) for stage in STAGES},
         "scene": name,
         "DOF": 3 * model.vertex_count,
         "launches": launches,
@@ -163,6 +192,21 @@ def predict(name: str, scene: pdipc.Scene, row: dict) -> dict:
         "measured": row["mean ms"],
         "MB": memory / 1e6,
         "largest": 3 * model.vertex_count * MEMORY / memory,
+    }
+
+
+def _sum(made: Sequence[tuple[float, Launch]]) -> dict:
+    """How often each launch is made, and it."""
+    fastest = MACHINES["H100"]
+    limits: dict[str, float] = defaultdict(float)
+    for number, each in made:
+        limits[each.limit(fastest)] += number * each.seconds(fastest)
+    return {
+        "launches": sum(number for number, _ in made),
+        "GB": 1e-9 * sum(number * each.bytes for number, each in made),
+        "Gflop": 2e-9 * sum(number * each.numbers for number, each in made),
+        "ms": 1e3 * sum(number * each.seconds(fastest) for number, each in made),
+        "limit": max(limits, key=limits.__getitem__) if limits else "",
     }
 
 
@@ -177,6 +221,7 @@ def print_table(names: Sequence[str] = ()) -> None:
     """Of the peers' scenes, and of Table 1's rows at the paper's size, whose own milliseconds stand beside; all that were measured or those named."""
     measured = {(row["part"], row["case"]): row for row in json.loads(MEASURED.read_text())["results"] if "outer" in row}
     print("\n".join(HEADER))
+    stages = []
     for part, name in ORDER:
         if (part, name) not in measured or (names and name not in names):
             continue
@@ -195,3 +240,11 @@ def print_table(names: Sequence[str] = ()) -> None:
             f"{r['measured'] / r['H100']:.1f} | {theirs} | {r['MB']:.0f} | {r['largest'] / 1e6:.0f} M |",
             flush=True,
         )
+        cells = [
+            f"{each['launches']:,.0f} / {each['GB']:.2f} / {each['Gflop']:.2f} / {each['ms']:.1f}, {each['limit']}"
+            for each in r["stages"].values()
+        ]
+        stages.append(f"| {name} | {' | '.join(cells)} |")
+    print("\nBy stage: launches / GB / Gflop / ms on an H100, and what most of that time goes to.\n")
+    print(f"| scene | {' | '.join(STAGES)} |\n| --- {'| --- ' * len(STAGES)}|")
+    print("\n".join(stages))

@@ -216,7 +216,7 @@ def test_rows_make_the_same_product(work, projected):
     friction.lag()
     friction.differentiate(upload(1e-4 * rng.standard_normal(x.shape)), flag(projected))
     for term in (pairs, friction):
-        rows = term.assemble()
+        rows = term.assemble(len(term.ends))
         ends, lengths, columns, values = (a.numpy() for a in (rows.ends, rows.lengths, rows.columns, rows.values))
         assert lengths.max() > 2
         for p in (rng.standard_normal(x.shape), np.ones_like(x)):

@@ -56,6 +56,7 @@ def alone(one, number, steps):
 def test_each_world_has_the_bits_that_it_has_alone(monkeypatch):
     """Also where a world takes its steps again, with more room for its pairs, while the others do not."""
     monkeypatch.setattr(pairs, "FIRST_PAIRS", 8)
+    monkeypatch.setattr(pairs, "PAIRS_OF_EACH", 0.0)
     worlds = pdipc.Worlds(pushed(), VARIANTS, device="cpu")
     grown = {step: set() for step in range(5)}
     for number, world in enumerate(worlds):

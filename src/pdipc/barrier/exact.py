@@ -420,10 +420,10 @@ class BarrierTerm(ActivePairs):
         self.differentiate(x)
         return self.force_of_vertex
 
-    def assemble(self):
+    def assemble(self, count: int):
         """See `linear.block_pcg.Coupling`."""
         assert self.rows is not None
-        return self.rows.assemble(assembly(self.real), self.operand(), self.free, self.ends, self.entries)
+        return self.rows.assemble(count, assembly(self.real), self.operand(), self.free, self.ends, self.entries)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (contact Hessian) p at free vertices, pair by pair and gathered per vertex. Recordable."""

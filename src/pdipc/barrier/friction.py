@@ -273,10 +273,10 @@ class FrictionTerm:
         quads, weights, force = listed(int(self.count.numpy()[0]), self.quads, self.weights, self.force)
         return Exerted(quads, weights[:, :, None] * force[:, None, :])
 
-    def assemble(self):
+    def assemble(self, count: int):
         """See `linear.block_pcg.Coupling`."""
         assert self.rows is not None
-        return self.rows.assemble(assembly(self.real), self.operand(), self.source.free, self.ends, self.entries)
+        return self.rows.assemble(count, assembly(self.real), self.operand(), self.source.free, self.ends, self.entries)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += (friction Hessian) p at free vertices. Recordable."""

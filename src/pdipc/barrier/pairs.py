@@ -31,7 +31,11 @@ from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
 from pdipc.linear.contact_rows import first_entry
 
-FIRST_PAIRS = 1024  # room at first
+FIRST_PAIRS, PAIRS_OF_EACH = (
+    1024,
+    0.25,
+)  # room at first, at least, and for each vertex: where it grows, a step is retaken and recorded anew
+MOST_SPARE = 1 << 18  # pairs; a list that grows has room for twice as many as were found, but for no more than so many besides
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
 
 
@@ -566,7 +570,7 @@ class FrozenPairs:
         self.degree = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(n, dtype=wp.int32, device=device.warp)
         self.generation = 0  # grows whenever arrays were replaced, so that recorded graphs are renewed
-        self._allocate(FIRST_PAIRS)
+        self._allocate(max(FIRST_PAIRS, int(PAIRS_OF_EACH * n)))
 
     def _allocate(self, capacity: int) -> None:
         real = self.real
@@ -623,7 +627,7 @@ class FrozenPairs:
         found = int(self.count.numpy()[1])
         if found <= self.capacity:
             return False
-        self._allocate(found + found // 2)
+        self._allocate(found + min(found, MOST_SPARE))
         return True
 
     def listed(self, *arrays: wp.array) -> list[np.ndarray]:

@@ -25,7 +25,11 @@ from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
 SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
-FIRST_PAIRS = 1024  # room of a list at first
+FIRST_PAIRS, PAIRS_OF_EACH = (
+    1024,
+    1.0,
+)  # room of a list at first, at least, and for each primitive: where it grows, a step is retaken and recorded anew
+MOST_SPARE = 1 << 20  # pairs; a list that grows has room for twice as many as were found, but for no more than so many besides
 LARGEST_LIST = 2**31 - 1
 FARTHEST = 1.0e18  # m
 
@@ -210,7 +214,7 @@ class PairList:
         self.found = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
         self.ends = wp.zeros(max(1, primitives), dtype=wp.int32, device=device.warp)
         self._room_for_slots(SLOTS)
-        self.pairs = wp.zeros(FIRST_PAIRS, dtype=wp.vec2i, device=device.warp)
+        self.pairs = wp.zeros(max(FIRST_PAIRS, int(PAIRS_OF_EACH * primitives)), dtype=wp.vec2i, device=device.warp)
         self.count = wp.zeros(2, dtype=wp.int32, device=device.warp)
 
     def _room_for_slots(self, each: int) -> None:
@@ -237,5 +241,5 @@ class PairList:
         if average > self.room:
             self._room_for_slots(min(average, MOST_SLOTS))
         del self.pairs  # freed before the larger one is made
-        self.pairs = wp.zeros(min(found + found // 4, LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
+        self.pairs = wp.zeros(min(found + min(found, MOST_SPARE), LARGEST_LIST), dtype=wp.vec2i, device=self.device.warp)
         return True

@@ -1,6 +1,6 @@
 """Running kernels: on CUDA as they are, on the CPU split over threads, and both as recorded graphs.
 
-Warp runs a CPU launch on one core and releases Python's lock while it does. So on the CPU each launch is cut into one range a
+Warp runs a CPU launch on one core and releases Python's lock while it does. So on the CPU each launch is cut into ranges, one or two a
 thread. A recorded graph goes further: every thread replays a graph of its own ranges in native code, and the threads meet after
 each kernel, which costs about a microsecond (`system.meet_kernel`) where a hand-over through Python costs sixty. Kernels never
 depend on how a range was cut, so results are the same to the last bit for any number of threads, captured or not.
@@ -39,6 +39,8 @@ CPU_BLOCK = 64  # list entries that one CPU thread takes at a time
 CUDA_BLOCK = 1
 CPU_SPLIT = 2048  # ranges shorter than this stay on one CPU thread when launched from Python
 GRAPH_SPLIT = 256  # likewise inside a recorded graph, where splitting is cheaper
+TURNS = 2  # ranges that each CPU thread has of a large launch in a graph: indices at the end, obstacles' vertices as a rule, have less work
+LARGE = 1024  # operations of such a range, at least
 CUDA_WORKERS = 1 << 17  # threads that share a list on CUDA
 BLOCK = 256  # threads of a block on CUDA where they work together
 WIDE_BLOCKS = 1024  # blocks that share a sum on CUDA; more numbers make longer strides
@@ -200,10 +202,11 @@ class Device:
             wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
         elif self._recording is not None:
             parts = self.threads if dim * grain >= GRAPH_SPLIT else 1
-            part = self._recording
-            low, high = (dim * part) // parts, (dim * (part + 1)) // parts
-            if part < parts and high > low:
-                wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp)
+            ranges = parts * max(1, min(TURNS, dim * grain // (parts * LARGE)))
+            for own in range(self._recording, ranges, parts) if self._recording < parts else ():
+                low, high = (dim * own) // ranges, (dim * (own + 1)) // ranges
+                if high > low:
+                    wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp)
             self._meet()
         elif self.threads == 1 or dim * grain < CPU_SPLIT:
             wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)

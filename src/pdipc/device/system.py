@@ -23,8 +23,9 @@ from pdipc.device.threads import cores
 # Threads meet after each kernel of a recorded graph. The last to arrive wakes the others. Those spin at first, since what they wait
 # for takes a microsecond as a rule. Where it takes longer, another process has a thread's core, two threads share one, or one has work
 # alone: they sleep (Linux) or give way (elsewhere). Who sleeps uses nothing of its share of the core and gets it at once when woken; who
-# spins, or gives way and comes back, waits behind whoever is busy, once more at every meeting. The more often spinning was in
-# vain without a success between, the shorter it lasts, but for one trial at length in 64.
+# spins, or gives way and comes back, waits behind whoever is busy, once more at every meeting. Where spinning was in vain eight times
+# without a success between, it lasts shorter from time to time, but for one trial at length in 64. Not at once: one thread's long work makes the
+# other sleep, which then comes late to the next meeting, so that the first would sleep there in turn, and so on.
 _MEET = """
     int* arrived = &meeting[0];
     int* generation = &meeting[16];
@@ -44,7 +45,8 @@ _MEET = """
         return;
     }
     int failed = __atomic_load_n(failures, __ATOMIC_RELAXED);
-    int spins = failed % 64 == 0 ? spin_limit : spin_limit >> (failed < 8 ? failed : 8);
+    const int often = failed < 8 ? 0 : failed < 16 ? failed - 8 : 8;
+    int spins = failed % 64 == 0 ? spin_limit : spin_limit >> often;
     for (; spins > 0; --spins) {
         if (__atomic_load_n(generation, __ATOMIC_ACQUIRE) != now) {
             if (failed != 0) { __atomic_store_n(failures, 0, __ATOMIC_RELAXED); }
@@ -87,7 +89,7 @@ _CLOCK = """
 """
 
 FUTEX = {"x86_64": 202}.get(platform.machine(), 98)  # the number of Linux's system call
-SPINS = 4000  # looks at the others before a thread sleeps or gives way, at most: some tens of microseconds
+SPINS = 16000  # looks at the others before a thread sleeps or gives way, at most: some hundred microseconds
 
 
 def _address(function: Any) -> wp.uint64:
@@ -164,7 +166,7 @@ def meet_inputs(meeting: wp.array, threads: int) -> list[Any]:
 
     Where there are more of them than cores, spinning keeps from work those that are waited for.
     """
-    return [meeting, threads, SPINS if threads <= cores() else SPINS >> 7, wait_call(), FUTEX]
+    return [meeting, threads, SPINS if threads <= cores() else SPINS >> 9, wait_call(), FUTEX]
 
 
 @functools.cache

@@ -37,11 +37,11 @@ class ContactRows:
         self.columns = wp.zeros(places, dtype=wp.int32, device=device.warp)
         self.values = wp.zeros(places, dtype=real.mat33, device=device.warp)
 
-    def assemble(self, kernel: Kernel, operand: Any, free: wp.array, ends: wp.array, entries: wp.array) -> Any:
-        """Launches the blocks, and returns what a product works on. kernel: of `assembly`, for `operand`; free: (n,) scalar, zero where nothing
-        is unknown; ends: (n,) int32, where the list of each vertex's pairs ends; entries: these lists, four times a pair plus a vertex's place in it.
+    def assemble(self, count: int, kernel: Kernel, operand: Any, free: wp.array, ends: wp.array, entries: wp.array) -> Any:
+        """Launches the blocks of the first `count` vertices, and returns what a product works on. kernel: of `assembly`, for `operand`; free: (n,) scalar, zero
+        where nothing is unknown; ends: (n,) int32, where the list of each vertex's pairs ends; entries: these lists, four times a pair plus a vertex's place in it.
         """
-        self.device.launch(kernel, len(ends), [operand, free, entries, self.lengths, self.columns, self.values], grain=16)
+        self.device.launch(kernel, count, [operand, free, entries, self.lengths, self.columns, self.values], grain=16)
         rows = kernels(self.real).Rows()
         rows.used, rows.ends = 1, ends
         rows.lengths, rows.columns, rows.values = self.lengths, self.columns, self.values
