@@ -455,7 +455,7 @@ class Newton(Descent):
         w = self.work
         if self.friction is not None:
             self.friction.differentiate(w.u, self.project)
-            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
+            self.vertex_sums.add([self.friction.energy_of_vertex], self.friction_old)
         if self.work.script.moves:
             self.device.launch_serial(self.kernels.any_driven, [len(w.script.movers), w.script.drive, self.driving])
             self.device.when(self.driving, self._foresee)
