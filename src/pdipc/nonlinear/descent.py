@@ -7,7 +7,8 @@ The potential of a step is that of Section 3, with the barrier and lagged fricti
 over the displacements u since the start of the step. After truncation Phi is compared, island by island. Where it rose, the island goes back
 along the same direction: first all of it to the least fraction that truncation left to one of its vertices, then by halves. What CCD has not
 proven is proven anew. So every outer iteration descends, unless a script moves something that the island may touch: then the potential itself
-has changed, and the island only goes back where truncation cut its step and it rose tenfold: to the least fraction, then by a few halves.
+has changed, and the island only goes back where truncation cut its step and it rose tenfold, to the least fraction, and from there by a few halves where most of the
+rise is in elements.
 """
 
 import functools
