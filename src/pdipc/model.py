@@ -26,7 +26,7 @@ from pdipc.linear.system import System
 from pdipc.scene.assembly import Assembly, assemble
 from pdipc.scene.check import refuse
 from pdipc.scene.errors import SceneWarning
-from pdipc.scene.reach import unresolved
+from pdipc.scene.reach import bursting, unresolved
 from pdipc.scene.schema import Scene, uses_newton
 from pdipc.scene.worlds import refuse_worlds
 
@@ -227,7 +227,7 @@ def build(scene: Scene, device: str | Device | None = None, masses: np.ndarray |
     precision = real(_precision(sim.precision, device.is_cuda, too_stiff))
     told = len(assembly.notes)
     refuse(scene, assembly, precision.name)
-    for note in [*assembly.notes[told:], *(too_stiff if precision.name == "float32" else [])]:
+    for note in [*assembly.notes[told:], *bursting(assembly), *(too_stiff if precision.name == "float32" else [])]:
         warnings.warn(note, SceneWarning, stacklevel=2)
     return _made(scene.settled(), assembly, device, precision)
 

@@ -1,5 +1,6 @@
 """Line searches that CCD interferes with, obstacles that push, and what rounding leaves: scenes that once ended at the cap."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,25 @@ def test_a_stiff_body_under_a_fast_plate_keeps_its_shape(monkeypatch):
     results = [simulation.step() for _ in range(11)]
     assert all(result.converged for result in results), [result.message for result in results if not result.converged]
     assert max(result.outer for result in results) <= 200
+
+
+@pytest.mark.parametrize(("seed", "steps"), [(77, 31), (93, 32)])
+def test_cloth_at_its_limit_that_is_pulled_stays_at_it(seed, steps, monkeypatch):
+    """Where something lands on it meanwhile: one long step once stretched it to four times its limit, with 1e9 J, and ended at the cap."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import kind_scenes
+    import kinds
+
+    _, drawn = kind_scenes.draw(seed)
+    drawn.simulation.precision = "float64"
+    simulation = pdipc.Simulation(drawn, "cpu")
+    worst = 0.0
+    for _ in range(steps):
+        result = simulation.step()
+        assert result.converged, result.message
+        assert result.outer <= 200
+        worst = max(worst, kinds.stretched(replace(simulation.model.assembly, positions=simulation.positions)))
+    assert 0.9 < worst < 1.02
 
 
 @pytest.mark.parametrize("speed", [1.0, 8.0])

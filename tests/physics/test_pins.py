@@ -45,6 +45,23 @@ def test_a_pin_along_one_axis_leaves_the_others_free(solver):
     assert y < -4e-3
 
 
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_rigid_body_on_a_rail_with_friction(precision):
+    """Along the rail it falls as fast as it would freely, and a cloth of friction beside it is no matter: once this did not begin."""
+    rail = {"select": EVERY, "axes": "yz", "stiffness": 1e5}
+    block = {**box("block"), "kind": "rigid", "pins": [rail]}
+    sheet = cloth("sheet", (0.3, 0.3), (4, 4), at=(0.0, -0.2, 0.0), pins=[{**rail, "axes": "y"}])
+    made = scene([block, sheet], contact={"friction": 0.5}, gravity=[2.0, -1.0, 0.0], time_step=H, precision=precision)
+    simulation = pdipc.Simulation(made, "cpu")
+    start, steps = simulation.positions, 10
+    for _ in range(steps):
+        assert simulation.step().converged
+    moved = simulation.positions - start
+    fallen = 2.0 * H * H * steps * (steps + 1) / 2
+    assert moved[:, 0] == pytest.approx(fallen, rel=1e-2)
+    assert np.abs(moved[:8, 1:]).max() < 1e-4
+
+
 def test_a_pin_holds_for_its_time_and_lets_go():
     """Free fall, caught where it is, then led by a motion from there, then free fall from rest: all exactly."""
     motion = {"velocity": [0.0, 0.0, 0.5], "start": 0.1}

@@ -71,6 +71,24 @@ def test_a_solid_that_is_too_stiff_for_float32():
     assert model._precision("auto", True, []) == "float32"
 
 
+def test_a_pressure_that_no_cloth_like_it_holds():
+    """A ball of 0.1 m and 100 N/m holds 500 Pa, as measured: at 1.0 times that it rests, at 1.1 times it grows without end."""
+
+    def told(pressure, **material):
+        cloth = {"membrane_stiffness": 100.0, "poisson_ratio": 0.0, **material}
+        ball = {"name": "ball", "kind": "cloth", "mesh": {"shape": "sphere", "radius": 0.1}, "material": cloth}
+        scene = pdipc.Scene(bodies=[{**ball, "inside": {"pressure": pressure}}])
+        return [line for line in hints(scene, assemble(scene)) if "without end" in line]
+
+    assert told(495.0) == [] and told(600.0, poisson_ratio=0.3) == []
+    assert told(2000.0, strain_limit=0.1) == [] and told(-2000.0) == []
+    (line,) = told(510.0)
+    assert "a pressure of 510 Pa" in line and '"ball"' in line and "holds 502 Pa" in line
+    with pytest.warns(pdipc.SceneWarning, match="without end"):
+        ball = {"name": "ball", "kind": "cloth", "mesh": {"shape": "sphere", "radius": 0.1}, "inside": {"pressure": 5e3}}
+        pdipc.Simulation(pdipc.Scene(bodies=[ball]), "cpu")
+
+
 def test_check_scene_prints_it(tmp_path):
     scene = tmp_path / "fast.toml"
     scene.write_text(

@@ -79,35 +79,51 @@ def kernels(real: Real) -> SimpleNamespace:
     def multiply(
         first: int,
         vertices: wp.array(dtype=wp.int32),
-        diagonal: wp.array(dtype=mat33),
+        blocks: wp.array(dtype=mat33),
         p: wp.array(dtype=vec3),
         y_out: wp.array(dtype=vec3),
     ):
-        i = vertices[first + wp.tid()]
-        y_out[i] = y_out[i] + diagonal[i] * p[i]
+        k = first + wp.tid()
+        i = vertices[k]
+        y_out[i] = y_out[i] + blocks[k] * p[i]
 
-    return SimpleNamespace(force=force, energy=energy, multiply=multiply)
+    @kernel(module)
+    def stiffen(
+        first: int,
+        vertices: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=mat33),
+        diagonal_out: wp.array(dtype=mat33),
+    ):
+        k = first + wp.tid()
+        i = vertices[k]
+        diagonal_out[i] = diagonal_out[i] + blocks[k]
+
+    return SimpleNamespace(force=force, energy=energy, multiply=multiply, stiffen=stiffen)
 
 
 class Rails:
     """The Hessian of a set as what Newton's matrix has beside the blocks of elements (`linear.block_pcg.Coupling`).
 
-    diagonal: (n,) 3x3 blocks, kg/s^2.
+    diagonal: None, what it adds to the preconditioner is added to the matrix's own, see `stiffen`.
     """
 
-    rows = None
+    diagonal = rows = None
 
-    def __init__(self, device: Device, real: Real, n: int, s: ConstraintSet):
+    def __init__(self, device: Device, real: Real, s: ConstraintSet):
         self.device, self._kernels = device, kernels(real)
-        blocks = np.zeros((n, 3, 3))
-        np.add.at(blocks, s.vertices[:, 0], s.weight[:, None, None] * np.eye(3) * s.data["axes"][:, None, :])
-        self.diagonal = wp.array(blocks, dtype=real.mat33, device=device.warp)
-        held = np.unique(s.vertices[:, 0]).astype(np.int32)
-        self._vertices, self._count = wp.array(held, device=device.warp), len(held)
+        held, own = np.unique(s.vertices[:, 0], return_inverse=True)
+        blocks = np.zeros((len(held), 3, 3))  # kg/s^2
+        np.add.at(blocks, own.ravel(), s.weight[:, None, None] * np.eye(3) * s.data["axes"][:, None, :])
+        self._blocks = wp.array(blocks, dtype=real.mat33, device=device.warp)
+        self._vertices, self._count = wp.array(held.astype(np.int32), device=device.warp), len(held)
 
     def apply(self, p: wp.array, y: wp.array) -> None:
         """y += w diag(axes) p. Recordable."""
-        self.device.launch(self._kernels.multiply, self._count, [self._vertices, self.diagonal, p, y])
+        self.device.launch(self._kernels.multiply, self._count, [self._vertices, self._blocks, p, y])
+
+    def stiffen(self, diagonal: wp.array) -> None:
+        """diagonal: (n,) 3x3 blocks, to which its own are added. Recordable."""
+        self.device.launch(self._kernels.stiffen, self._count, [self._vertices, self._blocks, diagonal])
 
     def couple(self, modes) -> None:
         """Nothing: few vertices, which the diagonal knows."""

@@ -133,7 +133,7 @@ class Projector:
             if kind is point_attachment:
                 self.anchors = rest[0]
             if kind is axis_attachment:
-                self.rails, self.rail_hessian = rest[0], axis_attachment.Rails(device, real, n_vertices, s)
+                self.rails, self.rail_hessian = rest[0], axis_attachment.Rails(device, real, s)
             if kind is stitch:
                 self.threads = rest[1]
             if kind is enclosed_volume:

@@ -7,7 +7,7 @@ The potential of a step is that of Section 3, with the barrier and lagged fricti
 over the displacements u since the start of the step. After truncation Phi is compared, island by island. Where it rose, the island goes back
 along the same direction: first all of it to the least fraction that truncation left to one of its vertices, then by halves. What CCD has not
 proven is proven anew. So every outer iteration descends, unless a script moves something that the island may touch: then the potential itself
-has changed, and the island only goes back to the least fraction where truncation cut its step and it rose tenfold.
+has changed, and the island only goes back where truncation cut its step and it rose tenfold: to the least fraction, then by a few halves.
 """
 
 import functools
@@ -32,6 +32,7 @@ from pdipc.integration import status
 from pdipc.integration.script import AHEAD, ARRIVED, WILL, led
 
 FIERCE = 10.0  # times its potential: where what is driven raises it by more, truncation has cut the step unevenly, and it is made even first
+PULLED = 5  # how often such a step is then halved, at most, as long as elements hold that many times what there was and what inertia has against it
 HALVINGS = 30  # of an island's step, then it stays where it is
 SQUEEZED = 1.0e-4  # of d_hat: a scripted vertex waits once a pair that it is part of has a smaller gap; what is heavy beside a cloth under it rests at 2e-4
 RESTRAIN = 0.5  # an island that keeps less of its step, since a pair was squeezed, takes shorter steps from then on
@@ -100,8 +101,12 @@ class Energies:
     friction_old: wp.array[wp.float64]
     base_new: wp.array[wp.float64]
     friction_new: wp.array[wp.float64]
+    effort: wp.array[wp.float64]  # what inertia has against the motion; this and the next are known where something is scripted
+    elastic: wp.array[wp.float64]  # what elements hold where it is tried
     before: wp.array[wp.float64]  # scratch
     after: wp.array[wp.float64]
+    most: wp.array[wp.float64]
+    stretched: wp.array[wp.float64]
 
 
 @struct
@@ -213,6 +218,12 @@ def kernels(real: Real) -> SimpleNamespace:
         energy_out[i] = wide(0.5) * energy + beside[i]
 
     @kernel(module)
+    def strive(first: int, o: Motion, mass: wp.array(dtype=scalar), h: scalar, energy_out: wp.array(dtype=wide)):
+        """m |u_tilde - u|^2 / (2 h^2) of each vertex."""
+        i = first + wp.tid()
+        energy_out[i] = wide(0.5) * wide(mass[i]) / (wide(h) * wide(h)) * squared(o.u_tilde[i], o.u[i])
+
+    @kernel(module)
     def judge(
         first: int,
         islands: Groups,
@@ -231,6 +242,8 @@ def kernels(real: Real) -> SimpleNamespace:
         for b in range(islands.count):
             e.before[b] = wide(0.0)
             e.after[b] = wide(0.0)
+            e.most[b] = wide(0.0)
+            e.stretched[b] = wide(0.0)
             search.accepted[b] = 0
             search.squeezed[b] = 0
         for b in range(islands.count):
@@ -239,6 +252,8 @@ def kernels(real: Real) -> SimpleNamespace:
                 search.squeezed[island] = 1
             e.before[island] = e.before[island] + e.base_old[b] + e.friction_old[b]
             e.after[island] = e.after[island] + e.base_new[b] + e.friction_new[b]
+            e.most[island] = e.most[island] + e.effort[b]
+            e.stretched[island] = e.stretched[island] + e.elastic[b]
             if islands.driven[b] != 0:
                 search.accepted[island] = 1
         searching = int(0)
@@ -248,7 +263,9 @@ def kernels(real: Real) -> SimpleNamespace:
             ok = search.accepted[island]
             unseen = slack * wp.abs(e.before[island]) + negligible
             risen = e.after[island] > wide(FIERCE) * wp.abs(e.before[island]) + unseen
-            if risen and search.attempts[0] == 0 and search.hits[0] > 0:
+            if search.attempts[0] > 0:
+                risen = e.stretched[island] > wide(FIERCE) * (wp.abs(e.before[island]) + e.most[island]) + unseen
+            if risen and search.attempts[0] <= PULLED and search.hits[0] > 0:
                 ok = 0
             if e.after[island] <= e.before[island] + unseen or search.attempts[0] > HALVINGS:
                 ok = 1
@@ -655,6 +672,7 @@ def kernels(real: Real) -> SimpleNamespace:
 
     return SimpleNamespace(
         inertia=inertia,
+        strive=strive,
         judge=judge,
         least_fraction=least_fraction,
         spread_least=spread_least,
@@ -718,7 +736,8 @@ class Descent:
         of_elements = [owner[s.vertices].max(axis=1) for s in model.projector.sets]
         elements = np.concatenate([*of_elements, np.zeros(0, dtype=owner.dtype)])
         self.base_sums = BodySums(device, [elements, owner], self.bodies)
-        self.friction_sums = BodySums(device, [owner], self.bodies)
+        self.elastic_sums = BodySums(device, [elements], self.bodies)
+        self.vertex_sums = BodySums(device, [owner], self.bodies)
 
         def zeros(dtype, count=n):
             return wp.zeros(max(1, count), dtype=dtype, device=device.warp)
@@ -735,7 +754,9 @@ class Descent:
         self.partial = zeros(scalar, self.parts.number)
         self.center, self.turn = (zeros(wp.vec3d, self.bodies) for _ in range(2))
         self.base_old, self.base_new, self.friction_old, self.friction_new = (zeros(wp.float64, self.bodies) for _ in range(4))
-        self.before, self.after = (zeros(wp.float64, self.bodies) for _ in range(2))
+        self.before, self.after, self.most, self.stretched = (zeros(wp.float64, self.bodies) for _ in range(4))
+        self.effort, self.elastic = (zeros(wp.float64, self.bodies) for _ in range(2))
+        self.vertex_effort = zeros(wp.float64)
         self.least, self.island_least = zeros(scalar, self.bodies), zeros(scalar, self.bodies)
         self.accepted, self.squeezed = zeros(wp.int32, self.bodies), zeros(wp.int32, self.bodies)
         flags = (zeros(wp.int32, 1) for _ in range(7))
@@ -816,10 +837,12 @@ class Descent:
         self._sum_energies()
         if self.friction is not None:
             self.friction.differentiate(u, self.project)
-            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_new)
+            self.vertex_sums.add([self.friction.energy_of_vertex], self.friction_new)
 
     def _sum_energies(self) -> None:
         self.base_sums.add([self.model.projector.energies, self.vertex_energy], self.base_new)
+        if self.work.script.moves:
+            self.elastic_sums.add([self.model.projector.energies], self.elastic)
 
     def _refer(self) -> None:
         """Energies count from what was accepted, at w.u."""
@@ -838,6 +861,9 @@ class Descent:
             inputs = [model.free, self.p, self.parts.share, self.partial, w.count]
             device.launch_blocks(k.note_motion, self.parts.number, inputs, grain=self.parts.size)
             islands.find_driven(w.candidates, w.u, w.u_tilde)
+            h = model.real.scalar(model.settings.time_step)
+            device.launch(k.strive, n, [self.motion, model.mass, h, self.vertex_effort])
+            self.vertex_sums.add([self.vertex_effort], self.effort)
         if not self.descends and self.bodies:
             device.launch(k.exempt, self.bodies, [islands.driven])
         self._evaluate(t.u_end, t.x_end)

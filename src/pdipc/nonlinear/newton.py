@@ -455,7 +455,7 @@ class Newton(Descent):
         w = self.work
         if self.friction is not None:
             self.friction.differentiate(w.u, self.project)
-            self.friction_sums.add([self.friction.energy_of_vertex], self.friction_old)
+            self.vertex_sums.add([self.friction.energy_of_vertex], self.friction_old)
         if self.work.script.moves:
             self.device.launch_serial(self.kernels.any_driven, [len(w.script.movers), w.script.drive, self.driving])
             self.device.when(self.driving, self._foresee)
@@ -494,9 +494,14 @@ class Newton(Descent):
         device.launch(k.propose, n, [*inputs, w.u_tilde, w.x_tilde])
 
     def _assemble(self) -> None:
-        self.matrix.restrain(self.islands.body, self.restraint)
-        self.matrix.assemble(self.work.x_start, self.work.u, self.project)
+        self._assemble_matrix(self.restraint)
         self.solver.prepare(self.work.x, self._couplings())
+
+    def _assemble_matrix(self, restraint: wp.array) -> None:
+        self.matrix.restrain(self.islands.body, restraint)
+        self.matrix.assemble(self.work.x_start, self.work.u, self.project)
+        if self.model.projector.rail_hessian is not None:
+            self.model.projector.rail_hessian.stiffen(self.matrix.diagonal)
 
     def _solve_linear(self) -> None:
         contacts = self._couplings()
@@ -527,8 +532,7 @@ class Newton(Descent):
         """The velocities of restitution, `r.u_now`, by one step: the correction is small beside what bends an element."""
         w, model, n = self.work, self.model, self.model.vertex_count
         self.device.launch_serial(self.kernels.set_flag, [self.project])
-        self.matrix.restrain(self.islands.body, self.unrestrained)
-        self.matrix.assemble(w.x_start, w.u, self.project)
+        self._assemble_matrix(self.unrestrained)
         r.linearize_exact(w.rest)
         led = w.led()
         led.drive = self.nobody
