@@ -307,7 +307,7 @@ def _settings(scene: Scene, assembly: Assembly) -> Settings:
         restitution=contact.restitution,
         damping=sim.damping,
         budget_ms=None if sim.budget_ms is None else sim.budget_ms / sim.substeps,
-        margin=0.5 * assembly.activation_distance,
+        margin=assembly.activation_distance,
     )
 
 
