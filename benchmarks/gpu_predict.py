@@ -68,12 +68,11 @@ class Tracer(Device):
 
     def _note(self, name: str, threads: int, inputs: Sequence[Any], shared: bool = False) -> None:
         """shared: whether the threads share the arrays out; else each has an index, and rows of a few entries."""
-        arrays = {each.ptr: (each.size, wp.types.type_size_in_bytes(each.dtype)) for each in _arrays(inputs)}
-        moved = sum(count * width for count, width in arrays.values())
-        numbers = sum(each.size * _numbers(each.dtype) for each in {each.ptr: each for each in _arrays(inputs)}.values())
-        reads = 0
-        for count, width in arrays.values():
-            own = -(-count // threads)
+        moved = numbers = reads = 0
+        for each in {each.ptr: each for each in _arrays(inputs)}.values():
+            width, own = wp.types.type_size_in_bytes(each.dtype), -(-each.size // threads)
+            moved += each.size * width
+            numbers += each.size * _numbers(each.dtype)
             reads += (own if shared or own <= ROW else 1) * -(-width // WORD)
         self._waiting.append((self._inside, Launch(name, "misc", moved, numbers, reads)))
 
@@ -217,13 +216,13 @@ HEADER = (
 PAPER_STAGES = slice(COLUMNS.index("solver ms"), COLUMNS.index("misc ms") + 1)
 
 
-def print_table(names: Sequence[str] = ()) -> None:
-    """Of the peers' scenes, and of Table 1's rows at the paper's size, whose own milliseconds stand beside; all that were measured or those named."""
+def print_table() -> None:
+    """Of the peers' scenes, and of Table 1's rows at the paper's size, whose own milliseconds stand beside; all that were measured."""
     measured = {(row["part"], row["case"]): row for row in json.loads(MEASURED.read_text())["results"] if "outer" in row}
     print("\n".join(HEADER))
     stages = []
     for part, name in ORDER:
-        if (part, name) not in measured or (names and name not in names):
+        if (part, name) not in measured:
             continue
         row = measured[part, name]
         paper = ROWS[name].paper if part == "paper scenes" else None

@@ -31,10 +31,8 @@ from pdipc.device.launch import Device, Reducer, Span
 from pdipc.device.precision import Real, Scalar
 from pdipc.linear.contact_rows import first_entry
 
-FIRST_PAIRS, PAIRS_OF_EACH = (
-    1024,
-    0.25,
-)  # room at first, at least, and for each vertex: where it grows, a step is retaken and recorded anew
+FIRST_PAIRS = 1024  # room at first, at least: a list that grows has the step retaken and recorded anew
+PAIRS_OF_EACH = 0.25  # room at first for each vertex
 MOST_SPARE = 1 << 18  # pairs; a list that grows has room for twice as many as were found, but for no more than so many besides
 LEAST_GAP = 16.0  # unit roundoffs of d_hat: smaller gaps are taken for this
 

@@ -25,10 +25,8 @@ from pdipc.device.launch import Device
 from pdipc.device.precision import Real
 
 SLOTS, MOST_SLOTS = 8, 48  # finds of a primitive that are kept; what finds more is searched a second time
-FIRST_PAIRS, PAIRS_OF_EACH = (
-    1024,
-    1.0,
-)  # room of a list at first, at least, and for each primitive: where it grows, a step is retaken and recorded anew
+FIRST_PAIRS = 1024  # room of a list at first, at least: one that grows has the step retaken and recorded anew
+PAIRS_OF_EACH = 1.0  # room of a list at first for each primitive
 MOST_SPARE = 1 << 20  # pairs; a list that grows has room for twice as many as were found, but for no more than so many besides
 LARGEST_LIST = 2**31 - 1
 FARTHEST = 1.0e18  # m

@@ -202,8 +202,9 @@ class Device:
             wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=self.warp)
         elif self._recording is not None:
             parts = self.threads if dim * grain >= GRAPH_SPLIT else 1
-            ranges = parts * max(1, min(TURNS, dim * grain // (parts * LARGE)))
-            for own in range(self._recording, ranges, parts) if self._recording < parts else ():
+            turns = 1 if parts == 1 else max(1, min(TURNS, dim * grain // (parts * LARGE)))
+            ranges = parts * turns
+            for own in range(self._recording, ranges, parts):
                 low, high = (dim * own) // ranges, (dim * (own + 1)) // ranges
                 if high > low:
                     wp.launch(kernel, dim=high - low, inputs=[low, *inputs], device=self.warp)

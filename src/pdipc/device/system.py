@@ -24,7 +24,7 @@ from pdipc.device.threads import cores
 # for takes a microsecond as a rule. Where it takes longer, another process has a thread's core, two threads share one, or one has work
 # alone: they sleep (Linux) or give way (elsewhere). Who sleeps uses nothing of its share of the core and gets it at once when woken; who
 # spins, or gives way and comes back, waits behind whoever is busy, once more at every meeting. Where spinning was in vain eight times
-# without a success between, it lasts shorter from time to time, but for one trial at length in 64. Not at once: one thread's long work makes the
+# without a success between, each time after lasts half as long, but for one trial at length in 64. Not at once: one thread's long work makes the
 # other sleep, which then comes late to the next meeting, so that the first would sleep there in turn, and so on.
 _MEET = """
     int* arrived = &meeting[0];
@@ -45,8 +45,8 @@ _MEET = """
         return;
     }
     int failed = __atomic_load_n(failures, __ATOMIC_RELAXED);
-    const int often = failed < 8 ? 0 : failed < 16 ? failed - 8 : 8;
-    int spins = failed % 64 == 0 ? spin_limit : spin_limit >> often;
+    const int shorter = failed < 8 ? 0 : failed < 16 ? failed - 8 : 8;
+    int spins = failed % 64 == 0 ? spin_limit : spin_limit >> shorter;
     for (; spins > 0; --spins) {
         if (__atomic_load_n(generation, __ATOMIC_ACQUIRE) != now) {
             if (failed != 0) { __atomic_store_n(failures, 0, __ATOMIC_RELAXED); }

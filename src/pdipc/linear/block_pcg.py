@@ -74,7 +74,7 @@ class BlockPcg:
         followers = [] if affine is None else affine.bodies
         self.modes = self.make_modes(free)
         self.tolerance, self.max_iterations = tolerance, most
-        self.sums = shared.Sums(device, matrix.unknown)
+        self.sums = shared.Sums(device, matrix.free_end)
 
         def zeros(dtype, count: int = n + 1) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device.warp)
@@ -119,7 +119,7 @@ class BlockPcg:
             diagonals.append(self.affine.diagonal)
         diagonals += [None] * (3 - len(diagonals))
         inputs = [self._unknown, self.matrix.diagonal, *diagonals, self._inverse]
-        self.device.launch(k.invert_diagonal, self.matrix.unknown, inputs, grain=32)
+        self.device.launch(k.invert_diagonal, self.matrix.free_end, inputs, grain=32)
         if self.modes.groups:
             self.modes.prepare(x, couplings)
 
@@ -138,7 +138,7 @@ class BlockPcg:
         tolerance will do. tolerance: where another one than the solver's own is wanted.
         """
         k, sums, status = self._kernels, self.sums, self.status(tolerance)
-        assembled = [c.assemble(self.matrix.unknown) for c in couplings if c.rows is not None]
+        assembled = [c.assemble(self.matrix.free_end) for c in couplings if c.rows is not None]
         couplings = [c for c in couplings if c.rows is None]
         assembled += [nothing(self.real)] * (2 - len(assembled))
 
@@ -178,17 +178,17 @@ class BlockPcg:
     def _find_residual(self, p: wp.array, b: wp.array, couplings: list[Coupling], assembled: list) -> None:
         """r = b - K p. couplings: those without rows; assembled: the rows of two others."""
         k, m = self._kernels, self.matrix
-        self.device.launch(k.clear, m.unknown, [self.w])
+        self.device.launch(k.clear, m.free_end, [self.w])
         if self.affine is not None:
             self.affine.expand(p)
         for c in couplings:
             c.apply(p, self.w)
-        self.device.launch(k.start, m.unknown, [m.rows, *assembled, self._free, b, p, self.vectors], grain=32)
+        self.device.launch(k.start, m.free_end, [m.rows, *assembled, self._free, b, p, self.vectors], grain=32)
 
     def _move_rigidly(self, p: wp.array) -> None:
         """The coarse part of the preconditioned residual alone: what flies freely is solved by that exactly, whatever the tolerance."""
         inputs = [self._unknown, self._inverse, self.r, self.u, p]
-        self.device.launch(self._kernels.move_rigidly, self.matrix.unknown, inputs)
+        self.device.launch(self._kernels.move_rigidly, self.matrix.free_end, inputs)
 
     def clear(self, values: wp.array) -> None:
         """Launches values = 0 over the vertices."""

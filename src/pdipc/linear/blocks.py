@@ -50,7 +50,7 @@ class Hessians(Protocol):
 class BlockMatrix:
     """offsets (n + 1,), columns (nnz,), values (nnz,) 3x3 on the device: the blocks off the diagonal, rows of free vertices only.
 
-    unknown: how many vertices there are up to the last free one; obstacles, which come last, have no rows.
+    free_end: how many vertices there are up to the last free one; obstacles, which come last, have no rows.
     held: (n,) kg/s^2, 0 where not free. diagonal: (n,) 3x3 blocks, the elastic ones with held; filled by `assemble`.
     pattern: the same pattern as a SciPy matrix, for what groups vertices. rows: what kernels take, of the type `rows_of`.
     """
@@ -58,7 +58,7 @@ class BlockMatrix:
     def __init__(self, device: Device, real: Real, projector: Hessians, held: np.ndarray, free: np.ndarray):
         n = len(free)
         self.device, self.real, self.count, self.projector = device, real, n, projector
-        self.unknown = int(np.flatnonzero(free).max(initial=-1)) + 1
+        self.free_end = int(np.flatnonzero(free).max(initial=-1)) + 1
         rows, columns, slots = [], [], []
         block = 0
         bending = {id(s) for s in projector.bending}
@@ -127,7 +127,7 @@ class BlockMatrix:
     def restrain(self, body: wp.array, restraint: wp.array) -> None:
         """Launches `held` as 1 + restraint times what it is by itself, body by body. body: (n,) int32, -1 for none."""
         inputs = [body, restraint, self._unrestrained, self.held]
-        self.device.launch(self._kernels.restrain, self.unknown, inputs)
+        self.device.launch(self._kernels.restrain, self.free_end, inputs)
 
     def assemble(self, base: wp.array, u: wp.array, project: wp.array) -> None:
         """Launches the values at x = base + u; project: see `Hessians`."""
@@ -145,7 +145,7 @@ class BlockMatrix:
             self.values,
         ]
         device.launch(k.gather, self._gathered, inputs, grain=16)
-        device.launch(k.gather_diagonal, self.unknown, [self.offsets, self.held, self.values, self.diagonal], grain=32)
+        device.launch(k.gather_diagonal, self.free_end, [self.offsets, self.held, self.values, self.diagonal], grain=32)
 
 
 def _scalars(s, n: int) -> sp.csr_matrix:
